@@ -1,0 +1,39 @@
+"""Build description of the ament_python package uw_dslam_ros2."""
+
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "uw_dslam_ros2"
+NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
+COMMANDS = ("simulate", "offline", "register", "evaluate", "study", "convert")
+
+# The settings live at the top of the repository; they are installed with the package when it is built from there.
+CONFIG = sorted(glob("../config/*.yaml")) if Path("../config").is_dir() else []
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    package_data={NAME: ["py.typed", "cli/templates/*"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+        (f"share/{NAME}/rviz", sorted(glob("rviz/*.rviz"))),
+        (f"share/{NAME}/config", CONFIG),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="uw_dslam maintainers",
+    maintainer_email="maintainers@users.noreply.github.com",
+    description="Distributed sonar mapping with several underwater vehicles.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            *(f"{node} = {NAME}.ros.{node}:main" for node in NODES),
+            *(f"{command} = {NAME}.cli.{command}:main" for command in COMMANDS),
+        ],
+    },
+)

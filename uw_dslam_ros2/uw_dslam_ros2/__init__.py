@@ -1,0 +1,1 @@
+"""Distributed sonar mapping with several underwater vehicles."""

@@ -1,0 +1,1 @@
+"""Numbers in, numbers out: no ROS, no files, no clock, no global state."""

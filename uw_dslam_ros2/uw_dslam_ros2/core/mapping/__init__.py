@@ -1,0 +1,1 @@
+"""Occupancy mapping, SLAM inside one vehicle, submaps."""

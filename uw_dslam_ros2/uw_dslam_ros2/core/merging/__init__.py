@@ -1,0 +1,1 @@
+"""Many submaps to one map: queue, pose graph, consistency, fusion."""

@@ -1,0 +1,1 @@
+"""Dead reckoning from DVL, IMU and depth, with covariance."""

@@ -1,0 +1,1 @@
+"""Certified registration of point sets and maps."""

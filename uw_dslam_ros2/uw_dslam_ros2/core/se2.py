@@ -1,0 +1,96 @@
+"""Rigid motions of the plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+
+__all__ = ["SE2", "wrap_angle"]
+
+FloatArray = NDArray[np.float64]
+_TWO_PI = 2.0 * math.pi
+
+
+@overload
+def wrap_angle(angle: float) -> float: ...
+@overload
+def wrap_angle(angle: FloatArray) -> FloatArray: ...
+def wrap_angle(angle: float | FloatArray) -> float | FloatArray:
+    """Wrap an angle [rad] to [-pi, pi)."""
+    wrapped = (angle + math.pi) % _TWO_PI - math.pi
+    # The remainder of a tiny negative number rounds up to the full turn.
+    if isinstance(wrapped, np.ndarray):
+        return np.where(wrapped >= math.pi, -math.pi, wrapped)
+    return -math.pi if wrapped >= math.pi else float(wrapped)
+
+
+@dataclass(frozen=True, slots=True)
+class SE2:
+    """A rigid motion ``p -> R(yaw) p + (x, y)``; named ``T_target_source`` after what it maps.
+
+    ``x`` and ``y`` in metres, ``yaw`` in radians, counter-clockwise, wrapped to [-pi, pi).
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "yaw"):
+            value = float(getattr(self, name))
+            if not math.isfinite(value):
+                raise InvalidInputError(f"SE2.{name} is {value}, expected a finite number")
+            object.__setattr__(self, name, wrap_angle(value) if name == "yaw" else value)
+
+    def __matmul__(self, other: SE2) -> SE2:
+        """Compose: ``T_a_c = T_a_b @ T_b_c``."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return SE2(
+            self.x + cos * other.x - sin * other.y,
+            self.y + sin * other.x + cos * other.y,
+            self.yaw + other.yaw,
+        )
+
+    def inverse(self) -> SE2:
+        """``T_source_target`` of a ``T_target_source``."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return SE2(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, -self.yaw)
+
+    def apply(self, points: ArrayLike) -> FloatArray:
+        """Move points (N, 2) [m], or one point (2,), from source to target coordinates."""
+        return np.asarray(points, dtype=np.float64) @ self.rotation().T + (self.x, self.y)
+
+    def rotation(self) -> FloatArray:
+        """Rotation matrix (2, 2)."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return np.array([[cos, -sin], [sin, cos]])
+
+    def matrix(self) -> FloatArray:
+        """Homogeneous matrix (3, 3)."""
+        matrix = np.eye(3)
+        matrix[:2, :2] = self.rotation()
+        matrix[:2, 2] = (self.x, self.y)
+        return matrix
+
+    def as_array(self) -> FloatArray:
+        """``[x, y, yaw]``, shape (3,)."""
+        return np.array([self.x, self.y, self.yaw])
+
+    @classmethod
+    def from_array(cls, values: ArrayLike) -> SE2:
+        """Build from ``[x, y, yaw]``."""
+        x, y, yaw = np.asarray(values, dtype=np.float64)
+        return cls(float(x), float(y), float(yaw))
+
+    def distance_to(self, other: SE2) -> tuple[float, float]:
+        """Translation [m] and absolute rotation [rad] between two motions into the same frame."""
+        return (
+            math.hypot(self.x - other.x, self.y - other.y),
+            abs(wrap_angle(self.yaw - other.yaw)),
+        )

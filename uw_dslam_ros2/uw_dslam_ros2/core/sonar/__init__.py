@@ -1,0 +1,1 @@
+"""Polar sonar images to detections."""

@@ -1,0 +1,53 @@
+"""What a sonar says: images, and the detections made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+
+__all__ = ["Detections", "SonarImage"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SonarImage:
+    """One ping of an imaging sonar in polar form.
+
+    ``intensity`` (R, B), any real type, [range, beam]. ``range_m`` (R,) centres of the range bins, rising.
+    ``bearing_rad`` (B,) of each beam, REP 103: positive to port (left), in either order, perhaps uneven.
+    """
+
+    stamp_ns: int
+    intensity: NDArray[np.generic]
+    range_m: FloatArray
+    bearing_rad: FloatArray
+
+    def __post_init__(self) -> None:
+        expected = (len(self.range_m), len(self.bearing_rad))
+        if self.intensity.shape != expected or 0 in expected:
+            raise InvalidInputError(
+                f"intensity has shape {self.intensity.shape}, expected (ranges, beams) = {expected}, none of them 0"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """Echoes of one ping, and how far each beam saw nothing.
+
+    ``points`` (N, 2) [m] in the sonar's frame (x forward, y left), ``weight`` (N,) in (0, 1].
+    ``bearing_rad`` (B,) and ``free_range_m`` (B,): along each beam the water is free up to there (0: nothing known).
+    ``beamwidth_rad`` and ``range_sigma_m`` size one echo's uncertainty.
+    """
+
+    stamp_ns: int
+    points: FloatArray
+    weight: FloatArray
+    bearing_rad: FloatArray
+    free_range_m: FloatArray
+    beamwidth_rad: float
+    range_sigma_m: float

@@ -1,0 +1,1 @@
+"""Files: bags, maps, settings, sessions, public data sets."""

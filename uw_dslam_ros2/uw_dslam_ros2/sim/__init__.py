@@ -1,0 +1,1 @@
+"""Simulated places, sonar images, noisy navigation and recordings."""
