@@ -1,4 +1,6 @@
-"""Settings: frozen dataclasses whose bounds and text live with the default; YAML and ROS parameters derive from them.
+"""Settings: frozen dataclasses whose bounds and text live with the default.
+
+YAML files and ROS parameters derive from them.
 
 ::
 
@@ -31,7 +33,7 @@ def setting(
     *,
     choices: Sequence[str] | None = None,
 ) -> Any:
-    """Field of a `Config`: default, bounds (inclusive, numbers only) and one line of description with the unit."""
+    """Field of a `Config`: default, inclusive bounds (of numbers), one line of text with the unit."""
     metadata = {"low": low, "high": high, "doc": doc, "choices": tuple(choices or ())}
     return dataclasses.field(default=default, metadata=metadata)
 

@@ -12,7 +12,7 @@ class ConfigError(UwDslamError, ValueError):
 
 
 class InvalidInputError(UwDslamError, ValueError):
-    """An argument or message is malformed; the text names the field, its value and what was expected."""
+    """An argument or message is malformed; names the field, its value and what was expected."""
 
 
 class DataError(UwDslamError, OSError):

@@ -1,4 +1,4 @@
-"""Grids of the plane: metres to [row, col] and back, and the two kinds of maps that live on them."""
+"""Grids of the plane: metres to [row, col] and back, and the maps that live on them."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 class GridSpec:
     """Where a grid lies.
 
-    Arrays are ``grid[row, col]``; row grows with y, column with x. ``T_frame_grid`` is the pose of the grid's own
-    axes: its translation is the outer corner of cell (0, 0), and cell centres sit at +0.5 cells from there. Its yaw
-    is 0 for almost every grid; a rotated origin in a message ends up here and is honoured everywhere.
+    Arrays are ``grid[row, col]``; row grows with y, column with x. ``T_frame_grid`` is the pose
+    of the grid's own axes: its translation is the outer corner of cell (0, 0), and cell centres
+    sit at +0.5 cells from there. Its yaw is 0 for almost every grid; a rotated origin in a
+    message ends up here and is honoured everywhere.
     """
 
     resolution_m: float
@@ -35,10 +36,13 @@ class GridSpec:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.resolution_m) and self.resolution_m > 0.0):
-            raise InvalidInputError(f"resolution is {self.resolution_m} m, expected a positive number")
+            raise InvalidInputError(
+                f"resolution is {self.resolution_m} m, expected a positive number"
+            )
         if self.num_rows < 1 or self.num_cols < 1:
             raise InvalidInputError(
-                f"grid is {self.num_rows} rows x {self.num_cols} columns, expected at least one cell"
+                f"grid is {self.num_rows} rows x {self.num_cols} columns, "
+                "expected at least one cell"
             )
 
     @property
@@ -47,7 +51,7 @@ class GridSpec:
         return self.num_rows, self.num_cols
 
     def cells_of(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Cells [row, col] (N, 2) that hold points (N, 2) [x, y] in metres; may lie outside the grid."""
+        """Cells [row, col] (N, 2) that hold points (N, 2) [x, y] [m]; may lie outside the grid."""
         local = self.T_frame_grid.inverse().apply(points) / self.resolution_m
         return np.floor(local[..., ::-1]).astype(np.int64)
 
@@ -80,7 +84,9 @@ class OccupancyMap:
     def __post_init__(self) -> None:
         values = np.asarray(self.values)
         if values.shape != self.spec.shape:
-            raise InvalidInputError(f"values have shape {values.shape}, expected {self.spec.shape}")
+            raise InvalidInputError(
+                f"values have shape {values.shape}, expected {self.spec.shape}"
+            )
         if values.dtype != np.int8:
             raise InvalidInputError(f"values have type {values.dtype}, expected int8")
         if values.min() < UNKNOWN or values.max() > OCCUPIED:
@@ -100,8 +106,8 @@ class OccupancyMap:
 class EvidenceGrid:
     """An occupancy grid as it is computed: natural log-odds, positive means occupied.
 
-    ``log_odds`` is float32 of ``spec.shape``. ``observed`` is a mask of its own, because log-odds 0 may also mean
-    echoes that contradict each other.
+    ``log_odds`` is float32 of ``spec.shape``. ``observed`` is a mask of its own, because log-odds
+    0 may also mean echoes that contradict each other.
     """
 
     spec: GridSpec
@@ -122,7 +128,7 @@ class EvidenceGrid:
 
     @classmethod
     def from_occupancy(cls, occupancy: OccupancyMap) -> EvidenceGrid:
-        """Undo `to_occupancy` up to its rounding; 0 and 100 percent become the odds of half a percent."""
+        """Undo `to_occupancy` up to its rounding; 0 and 100 become half a percent from there."""
         probability = np.clip(occupancy.values.astype(np.float64) / 100.0, 0.005, 0.995)
         log_odds = np.log(probability / (1.0 - probability))
         known = occupancy.known

@@ -20,10 +20,11 @@ SubmapId = tuple[str, int]
 class Submap:
     """One piece of one vehicle's map, short enough to be rigid; as in ``uw_dslam_msgs/Submap``.
 
-    ``T_odom_submap`` places the submap's frame in the vehicle's odom frame; ``covariance`` (3, 3), order x, y, yaw,
-    is that of the pose relative to the vehicle's previous submap (to odom's origin for the first). ``points`` (N, 2)
-    [m] are features in the submap's frame. ``trajectory`` (K, 3) [x, y, yaw] of base_link in the submap's frame at
-    times ``trajectory_stamp_ns`` (K,).
+    ``T_odom_submap`` places the submap's frame in the vehicle's odom frame; ``covariance`` (3,
+    3), order x, y, yaw, is that of the pose relative to the vehicle's previous submap (to odom's
+    origin for the first). ``points`` (N, 2) [m] are features in the submap's frame.
+    ``trajectory`` (K, 3) [x, y, yaw] of base_link in the submap's frame at times
+    ``trajectory_stamp_ns`` (K,).
     """
 
     vehicle_id: str

@@ -13,6 +13,10 @@ from uw_dslam_ros2.core.se2 import SE2
 __all__ = ["PriorWindow", "Progress", "RegistrationResult", "Rival", "Verdict"]
 
 
+def _relative_gap(lower_bound: float, upper_bound: float) -> float:
+    return (upper_bound - lower_bound) / upper_bound if upper_bound > 0.0 else 0.0
+
+
 class Verdict(enum.IntEnum):
     """Outcome of a match; the numbers are those of ``uw_dslam_msgs/Registration``."""
 
@@ -56,15 +60,16 @@ class Progress:
     @property
     def gap(self) -> float:
         """Relative gap, in [0, 1]."""
-        return (self.upper_bound - self.lower_bound) / self.upper_bound if self.upper_bound > 0 else 0.0
+        return _relative_gap(self.lower_bound, self.upper_bound)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegistrationResult:
     """Outcome of one match. "Nothing found" is a result; only wrong input is an exception.
 
-    ``T_target_source`` is the best guess even where the verdict refuses it, for logs and pictures: callers must look
-    at `is_accepted`. Scores and bounds are in one unit, 1 being a perfect match of all source weight.
+    ``T_target_source`` is the best guess even where the verdict refuses it, for logs and
+    pictures: callers must look at `is_accepted`. Scores and bounds are in one unit, 1 being a
+    perfect match of all source weight.
     """
 
     verdict: Verdict
@@ -86,7 +91,8 @@ class RegistrationResult:
     rivals: tuple[Rival, ...] = ()
     source_points: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
     target_points: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
-    is_inlier: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  # of source_points
+    # Of source_points.
+    is_inlier: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
     @property
     def is_accepted(self) -> bool:
@@ -96,6 +102,4 @@ class RegistrationResult:
     @property
     def gap(self) -> float:
         """Relative gap between the bounds, in [0, 1]."""
-        if self.upper_bound <= 0.0:
-            return 0.0
-        return (self.upper_bound - self.lower_bound) / self.upper_bound
+        return _relative_gap(self.lower_bound, self.upper_bound)

@@ -18,8 +18,9 @@ FloatArray = NDArray[np.float64]
 class SonarImage:
     """One ping of an imaging sonar in polar form.
 
-    ``intensity`` (R, B), any real type, [range, beam]. ``range_m`` (R,) centres of the range bins, rising.
-    ``bearing_rad`` (B,) of each beam, REP 103: positive to port (left), in either order, perhaps uneven.
+    ``intensity`` (R, B), any real type, [range, beam]. ``range_m`` (R,) centres of the range
+    bins, rising. ``bearing_rad`` (B,) of each beam, REP 103: positive to port (left), in either
+    order, perhaps uneven.
     """
 
     stamp_ns: int
@@ -31,7 +32,8 @@ class SonarImage:
         expected = (len(self.range_m), len(self.bearing_rad))
         if self.intensity.shape != expected or 0 in expected:
             raise InvalidInputError(
-                f"intensity has shape {self.intensity.shape}, expected (ranges, beams) = {expected}, none of them 0"
+                f"intensity has shape {self.intensity.shape}, "
+                f"expected (ranges, beams) = {expected}, none of them 0"
             )
 
 
@@ -40,8 +42,8 @@ class Detections:
     """Echoes of one ping, and how far each beam saw nothing.
 
     ``points`` (N, 2) [m] in the sonar's frame (x forward, y left), ``weight`` (N,) in (0, 1].
-    ``bearing_rad`` (B,) and ``free_range_m`` (B,): along each beam the water is free up to there (0: nothing known).
-    ``beamwidth_rad`` and ``range_sigma_m`` size one echo's uncertainty.
+    ``bearing_rad`` (B,) and ``free_range_m`` (B,): along each beam the water is free up to there
+    (0: nothing known). ``beamwidth_rad`` and ``range_sigma_m`` size one echo's uncertainty.
     """
 
     stamp_ns: int
