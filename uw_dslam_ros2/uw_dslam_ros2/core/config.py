@@ -33,7 +33,7 @@ def setting(
     *,
     choices: Sequence[str] | None = None,
 ) -> Any:
-    """Field of a `Config`: default, inclusive bounds (of numbers), one line of text with the unit."""
+    """Field of a `Config`: default, inclusive bounds of numbers, a line of text with the unit."""
     metadata = {"low": low, "high": high, "doc": doc, "choices": tuple(choices or ())}
     return dataclasses.field(default=default, metadata=metadata)
 
