@@ -1,0 +1,177 @@
+import numpy as np
+import pytest
+from unit.io.bag_messages import SECOND, write_vehicle
+
+from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.mounting import planar_mount
+from uw_dslam_ros2.io.bags import (
+    BagWriter,
+    DepthEvent,
+    ImageEvent,
+    ImuEvent,
+    PointsEvent,
+    TransformEvent,
+    TruthEvent,
+    VelocityEvent,
+    open_bag,
+    read_events,
+)
+from uw_dslam_ros2.io.outgoing import MessageFactory
+
+
+def write_bag(path, storage="mcap", **kwargs):
+    with BagWriter(path, storage) as writer:
+        write_vehicle(writer, MessageFactory(writer.typestore), **kwargs)
+    return path
+
+
+def storage_file(bag):
+    (path,) = [p for p in bag.iterdir() if p.suffix in (".mcap", ".db3")]
+    return path
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_events_are_what_was_written(tmp_path, storage):
+    events = list(read_events(write_bag(tmp_path / "bag", storage)))
+
+    assert [type(e) for e in events] == [
+        TransformEvent,
+        ImageEvent,
+        ImuEvent,
+        VelocityEvent,  # the second one has no bottom lock
+        VelocityEvent,
+        DepthEvent,
+        PointsEvent,
+        TruthEvent,
+    ]
+    assert {e.vehicle_id for e in events} == {"auv_1"}
+    mount, image, imu, dvl, twist, depth, points, truth = events
+    assert [e.stamp_ns // SECOND for e in events[1:]] == [10, 11, 12, 14, 15, 16, 17]
+    assert (mount.frame_id, mount.child_frame_id) == ("auv_1/base_link", "auv_1/dvl")
+    assert planar_mount(mount.T_parent_child).as_array() == pytest.approx([0.1, 0.2, 0.0])
+    np.testing.assert_array_equal(image.image.intensity[1], [3, 4, 5])
+    np.testing.assert_allclose(image.image.bearing_rad, [1.0, 0.15**3, -(0.7**3)], atol=1e-9)
+    np.testing.assert_allclose(image.image.range_m, [1.0, 1.5, 2.0, 2.5, 3.0])
+    assert (imu.yaw_rad, imu.yaw_variance) == pytest.approx((0.5, 0.01))
+    assert imu.yaw_rate_rad_s == -0.25
+    np.testing.assert_allclose(dvl.velocity_m_s, [1.0, 0.25])
+    np.testing.assert_allclose(dvl.covariance, 1e-4 * np.eye(2))
+    np.testing.assert_allclose(twist.velocity_m_s, [1.0, 0.25])
+    assert depth.depth_m == pytest.approx(2.5)
+    np.testing.assert_allclose(points.points, [[1.0, -2.0], [3.5, 4.25]])
+    assert truth.T_world_base.as_array() == pytest.approx([1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_raw_messages_can_be_chosen_by_topic_and_time(tmp_path, storage):
+    with open_bag(write_bag(tmp_path / "bag", storage)) as bag:
+        assert bag.topics["/auv_1/imu"] == "sensor_msgs/msg/Imu"
+        assert (bag.start_ns, bag.end_ns) == (10 * SECOND, 17 * SECOND)
+        assert len(list(bag.raw())) == 9
+        dvl = list(bag.raw(["/auv_1/dvl"]))
+        assert [m.stamp_ns // SECOND for m in dvl] == [12, 13]
+        window = list(bag.raw(start_ns=12 * SECOND, stop_ns=15 * SECOND))
+        assert [m.stamp_ns // SECOND for m in window] == [12, 13, 14]
+        (message,) = bag.messages(["/auv_1/imu"])
+        assert message.content.angular_velocity.z == -0.25
+        with pytest.raises(DataError, match="no topic /auv_1/nothing"):
+            list(bag.raw(["/auv_1/nothing"]))
+
+
+def test_a_single_storage_file_is_a_bag_too(tmp_path):
+    bag = write_bag(tmp_path / "bag")
+    assert len(list(read_events(storage_file(bag)))) == len(list(read_events(bag)))
+
+
+def test_several_bags_are_merged_by_time(tmp_path):
+    first = write_bag(tmp_path / "a", vehicle="auv_1", first_s=10)
+    second = write_bag(tmp_path / "b", "sqlite3", vehicle="auv_2", first_s=12)
+    events = list(read_events([second, first]))
+    assert [type(e) for e in events[:2]] == [TransformEvent, TransformEvent]
+    stamps = [e.stamp_ns for e in events[2:]]
+    assert stamps == sorted(stamps)
+    assert {e.vehicle_id for e in events} == {"auv_1", "auv_2"}
+
+
+def test_writing_is_reproducible(tmp_path):
+    files = [storage_file(write_bag(tmp_path / name / "bag")) for name in ("a", "b")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_topics_can_be_renamed(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        make = MessageFactory(writer.typestore)
+        writer.add_topic("/heading", "sensor_msgs/msg/Imu")
+        writer.write("/heading", 5, make.imu(5, "imu", 1.0, 0.1, None, 0.0))
+    with pytest.raises(DataError, match="none of its topics is known"):
+        list(read_events(tmp_path / "bag"))
+    (event,) = read_events(tmp_path / "bag", "auv_7", topics={"imu": "/heading"})
+    assert (event.vehicle_id, event.yaw_rate_rad_s) == ("auv_7", None)
+    assert event.yaw_rad == pytest.approx(1.0)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(DataError, match=r"nowhere does not exist; expected a rosbag2"):
+        list(read_events(tmp_path / "nowhere"))
+
+
+def test_folder_without_metadata(tmp_path):
+    with pytest.raises(DataError, match=r"no metadata\.yaml"):
+        list(read_events(tmp_path))
+
+
+def test_file_of_another_format(tmp_path):
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(DataError, match="is not a bag"):
+        list(read_events(tmp_path / "notes.txt"))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("keep", [0.0, 0.02, 0.3, 0.6, 0.9, 0.999])
+def test_truncated_bag(tmp_path, storage, keep):
+    bag = write_bag(tmp_path / "bag", storage)
+    path = storage_file(bag)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(keep * len(content))])
+    for target in (bag, path):
+        with pytest.raises(DataError, match=f"{path.name if target is path else 'bag'}.* is"):
+            list(read_events(target))
+
+
+def test_empty_bag(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
+    with pytest.raises(DataError, match="is empty; expected a recording with at least one"):
+        list(read_events(tmp_path / "bag"))
+
+
+def test_wrong_topic_type(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        make = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/sonar", "sensor_msgs/msg/Imu")
+        writer.write("/auv_1/sonar", 5, make.imu(5, "imu", 1.0, 0.1, None, 0.0))
+    with pytest.raises(DataError, match=r"/auv_1/sonar has type .*Imu, expected .*Projected"):
+        list(read_events(tmp_path / "bag"))
+
+
+def test_malformed_message_names_bag_topic_and_field(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        make = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
+        writer.write("/auv_1/imu", 5, make.imu(5, "imu", None, 0.1, float("nan"), 0.0))
+    with pytest.raises(DataError, match=r"bag: bad message on /auv_1/imu .*angular_velocity\.z"):
+        list(read_events(tmp_path / "bag"))
+
+
+def test_message_that_does_not_fit_its_type(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
+        writer.write_raw("/auv_1/imu", 5, b"\x00\x01\x00\x00\x07")
+    with pytest.raises(DataError, match="does not fit its type sensor_msgs/msg/Imu"):
+        list(read_events(tmp_path / "bag"))
+
+
+def test_a_bag_is_not_overwritten(tmp_path):
+    write_bag(tmp_path / "bag")
+    with pytest.raises(DataError, match="exists already"):
+        BagWriter(tmp_path / "bag")
