@@ -1,1 +1,14 @@
-"""Polar sonar images to detections."""
+"""Sonar front end: images, scans or points to detections."""
+
+from uw_dslam_ros2.core.sonar.config import SonarConfig
+from uw_dslam_ros2.core.sonar.detect import detect, detections_from_points, detections_from_scan
+from uw_dslam_ros2.core.sonar.types import Detections, SonarImage
+
+__all__ = [
+    "Detections",
+    "SonarConfig",
+    "SonarImage",
+    "detect",
+    "detections_from_points",
+    "detections_from_scan",
+]

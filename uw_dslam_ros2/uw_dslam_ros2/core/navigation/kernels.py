@@ -1,0 +1,92 @@
+"""Compiled steps of the navigation filter.
+
+State (14): x, y, yaw in odom; vx, vy body velocity over ground; yaw rate; gyro bias; velocity
+scale error; heading offset; current cx, cy in odom; clone of an earlier pose ax, ay, ayaw.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = ["NUM_STATES", "gated_update", "predict"]
+
+NUM_STATES = 14
+
+
+@njit(cache=True, nogil=True)
+def predict(state, covariance, dt_s, noise):  # type: ignore[no-untyped-def]
+    """Motion over `dt_s`; `noise` (7,): walks of velocity, turn, bias; sigma and time of heading
+    offset, of current.
+
+    Constant velocity and constant turn; offset and current are first-order Gauss-Markov. Returns
+    new arrays.
+    """
+    x = state.copy()
+    heading = state[2] + 0.5 * state[5] * dt_s
+    cos, sin = np.cos(heading), np.sin(heading)
+    vx, vy = state[3], state[4]
+    x[0] += (cos * vx - sin * vy) * dt_s
+    x[1] += (sin * vx + cos * vy) * dt_s
+    x[2] += state[5] * dt_s
+    keep_offset = np.exp(-dt_s / noise[4])
+    keep_current = np.exp(-dt_s / noise[6])
+    x[8] *= keep_offset
+    x[9] *= keep_current
+    x[10] *= keep_current
+    jac = np.eye(NUM_STATES)
+    along, across = (-sin * vx - cos * vy) * dt_s, (cos * vx - sin * vy) * dt_s
+    jac[0, 2], jac[0, 3], jac[0, 4], jac[0, 5] = along, cos * dt_s, -sin * dt_s, 0.5 * along * dt_s
+    jac[1, 2], jac[1, 3], jac[1, 4], jac[1, 5] = (
+        across,
+        sin * dt_s,
+        cos * dt_s,
+        0.5 * across * dt_s,
+    )
+    jac[2, 5] = dt_s
+    jac[8, 8] = keep_offset
+    jac[9, 9] = keep_current
+    jac[10, 10] = keep_current
+    cov = jac @ covariance @ jac.T
+    # White acceleration: position and velocity noise belong together.
+    q_v, q_r = noise[0] * noise[0] * dt_s, noise[1] * noise[1] * dt_s
+    for axis in range(2):
+        cov[axis, axis] += q_v * dt_s * dt_s / 3.0
+        cov[3 + axis, 3 + axis] += q_v
+    half = 0.5 * q_v * dt_s
+    cov[0, 3] += half * cos
+    cov[3, 0] += half * cos
+    cov[0, 4] -= half * sin
+    cov[4, 0] -= half * sin
+    cov[1, 3] += half * sin
+    cov[3, 1] += half * sin
+    cov[1, 4] += half * cos
+    cov[4, 1] += half * cos
+    cov[2, 2] += q_r * dt_s * dt_s / 3.0
+    cov[2, 5] += 0.5 * q_r * dt_s
+    cov[5, 2] += 0.5 * q_r * dt_s
+    cov[5, 5] += q_r
+    cov[6, 6] += noise[2] * noise[2] * dt_s
+    cov[8, 8] += noise[3] * noise[3] * (1.0 - keep_offset * keep_offset)
+    cov[9, 9] += noise[5] * noise[5] * (1.0 - keep_current * keep_current)
+    cov[10, 10] += noise[5] * noise[5] * (1.0 - keep_current * keep_current)
+    return x, cov
+
+
+@njit(cache=True, nogil=True)
+def gated_update(state, covariance, innovation, jac, noise, gate):  # type: ignore[no-untyped-def]
+    """Kalman update (Joseph form) unless the squared Mahalanobis distance exceeds `gate`
+    (negative: no gate).
+
+    Returns the new state, covariance and the squared distance; the old ones where the gate
+    refused.
+    """
+    cross = covariance @ jac.T
+    spread = jac @ cross + noise
+    distance = innovation @ np.linalg.solve(spread, innovation)
+    if 0.0 <= gate < distance:
+        return state, covariance, distance
+    gain = np.linalg.solve(spread, cross.T).T
+    shrink = np.eye(NUM_STATES) - gain @ jac
+    updated = shrink @ covariance @ shrink.T + gain @ noise @ gain.T
+    return state + gain @ innovation, 0.5 * (updated + updated.T), distance

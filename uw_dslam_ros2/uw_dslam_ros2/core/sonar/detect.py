@@ -1,0 +1,228 @@
+"""From a sonar's image, scan or points to detections."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.sonar.cfar import cell_averaging_factors, smallest_of_factor
+from uw_dslam_ros2.core.sonar.config import SonarConfig
+from uw_dslam_ros2.core.sonar.kernels import (
+    cfar_ratio,
+    neighbor_counts,
+    row_ratio,
+    select_returns,
+    to_power,
+)
+from uw_dslam_ros2.core.sonar.types import Detections, SonarImage
+
+__all__ = ["detect", "detections_from_points", "detections_from_scan"]
+
+FloatArray = NDArray[np.float64]
+_MODES = {"first": 0, "strongest": 1, "all": 2}
+_MIN_WEIGHT = 0.1
+
+
+def detect(image: SonarImage, config: SonarConfig = SonarConfig()) -> Detections:  # noqa: B008 (frozen)
+    """Find the echoes of one ping.
+
+    Threshold segmentation, then distance-constrained filtering, after Cheng et al. 2022 (Front.
+    Neurorobot. 15:801956).
+
+    Parameters
+    ----------
+    image : SonarImage
+        Any integer or real type, any bearings, any range bins.
+    config : SonarConfig
+        The stages.
+
+    Raises
+    ------
+    InvalidInputError
+        Ranges that do not rise, bearings or intensities that are not finite.
+    """
+    range_m, bearing_rad = _checked_axes(image)
+    beamwidth_rad = _beamwidth(bearing_rad, config)
+    first, last = np.searchsorted(range_m, [config.min_range_m, config.max_range_m], side="left")
+    bin_m = float(np.median(np.diff(range_m))) if len(range_m) > 1 else 0.0
+    range_sigma_m = float(np.hypot(config.range_sigma_m, bin_m / np.sqrt(12.0)))
+    if last <= first:
+        nothing = np.empty(0)
+        return Detections(
+            image.stamp_ns, np.empty((0, 2)), nothing, bearing_rad, np.zeros(len(bearing_rad)),
+            beamwidth_rad, range_sigma_m,
+        )  # fmt: skip
+    power = to_power(
+        np.ascontiguousarray(image.intensity), config.intensity == "amplitude", first, last
+    )
+    if not np.isfinite(power[:, :].sum(dtype=np.float64)):
+        raise InvalidInputError("intensity holds values that are not finite")
+    ratio = _threshold_ratio(power, _full_scale(image.intensity.dtype), config)
+    gap_bins = config.min_separation_m / bin_m if bin_m > 0.0 else 1.0
+    beams, bins, strengths, first_above = select_returns(
+        power, ratio, _MODES[config.returns], gap_bins
+    )
+    echo_range_m = np.interp(first + bins, np.arange(len(range_m)), range_m)
+    points = _polar(echo_range_m, bearing_rad[beams])
+    keep = has_neighbors(points, beamwidth_rad, config)
+    # What the filter threw away was an echo of something: the water behind it stays unknown.
+    free_range_m = np.where(
+        first_above >= 0,
+        range_m[first + np.maximum(first_above, 0)] - 0.5 * bin_m,
+        config.no_echo_free_share * range_m[last - 1],
+    )
+    return Detections(
+        image.stamp_ns,
+        points[keep],
+        np.clip(1.0 - 1.0 / strengths[keep], _MIN_WEIGHT, 1.0),
+        bearing_rad,
+        np.maximum(free_range_m, 0.0),
+        beamwidth_rad,
+        range_sigma_m,
+    )
+
+
+def detections_from_scan(
+    stamp_ns: int,
+    angles_rad: ArrayLike,
+    ranges_m: ArrayLike,
+    range_max_m: float,
+    config: SonarConfig = SonarConfig(),  # noqa: B008 (frozen)
+) -> Detections:
+    """Detections of a scan: angles (B,) and ranges (B,) in the sonar's frame.
+
+    A range that is not finite, or not within the range gate and `range_max_m`, is no echo.
+    Infinity says that the beam met nothing, so the water is free for `no_echo_free_share` of
+    `range_max_m`; NaN says nothing.
+    """
+    bearing = np.asarray(angles_rad, dtype=np.float64)
+    ranges = np.asarray(ranges_m, dtype=np.float64)
+    if bearing.ndim != 1 or bearing.shape != ranges.shape or len(bearing) == 0:
+        raise InvalidInputError(
+            f"angles have shape {bearing.shape} and ranges {ranges.shape}, expected the same (B "
+            f"> 0,)"
+        )
+    if not np.isfinite(bearing).all():
+        raise InvalidInputError("angles hold values that are not finite")
+    if not (np.isfinite(range_max_m) and range_max_m > 0.0):
+        raise InvalidInputError(f"range_max_m is {range_max_m}, expected a positive number")
+    limit = min(range_max_m, config.max_range_m)
+    is_echo = np.isfinite(ranges) & (ranges >= config.min_range_m) & (ranges < limit)
+    points = _polar(ranges[is_echo], bearing[is_echo])
+    beamwidth_rad = _beamwidth(bearing, config)
+    keep = has_neighbors(points, beamwidth_rad, config)
+    free = np.zeros(len(bearing))
+    free[is_echo] = ranges[is_echo]
+    met_nothing = (ranges >= limit) & ~np.isnan(ranges)
+    free[met_nothing] = config.no_echo_free_share * limit
+    return Detections(
+        stamp_ns,
+        points[keep],
+        np.ones(int(keep.sum())),
+        bearing,
+        free,
+        beamwidth_rad,
+        config.range_sigma_m,
+    )
+
+
+def detections_from_points(
+    stamp_ns: int,
+    points: ArrayLike,
+    config: SonarConfig = SonarConfig(),  # noqa: B008 (frozen)
+    beam_spacing_rad: float = 0.02,
+) -> Detections:
+    """Detections that somebody else has made, (N, 2) [m] in the sonar's frame (x forward, y left).
+
+    Which beams met nothing is not known, so the water counts as free only before the nearest point
+    of a bearing.
+    """
+    xy = np.asarray(points, dtype=np.float64)
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise InvalidInputError(f"points have shape {xy.shape}, expected (N, 2)")
+    if not np.isfinite(xy).all():
+        raise InvalidInputError("points hold coordinates that are not finite")
+    ranges = np.hypot(xy[:, 0], xy[:, 1])
+    inside = (ranges >= config.min_range_m) & (ranges < config.max_range_m)
+    xy, ranges = xy[inside], ranges[inside]
+    width = config.beamwidth_rad or beam_spacing_rad
+    keep = has_neighbors(xy, width, config)
+    beams = np.floor(np.arctan2(xy[:, 1], xy[:, 0]) / width).astype(np.int64)
+    unique, inverse = np.unique(beams, return_inverse=True)
+    nearest = np.full(len(unique), np.inf)
+    np.minimum.at(nearest, inverse, ranges)
+    return Detections(
+        stamp_ns,
+        xy[keep],
+        np.ones(int(keep.sum())),
+        np.asarray((unique + 0.5) * width, np.float64),
+        nearest,
+        width,
+        config.range_sigma_m,
+    )
+
+
+def has_neighbors(
+    points: FloatArray, beamwidth_rad: float, config: SonarConfig
+) -> NDArray[np.bool_]:
+    """Distance-constrained filter: which points (N, 2) have `min_neighbors` others near them.
+
+    Beams spread, so the reach grows by the distance between two neighbouring beams at the point's
+    range.
+    """
+    if config.neighbor_distance_m <= 0.0 or len(points) == 0:
+        return np.ones(len(points), np.bool_)
+    reach = config.neighbor_distance_m + beamwidth_rad * np.hypot(points[:, 0], points[:, 1])
+    order = np.argsort(points[:, 0], kind="stable")
+    counts = np.empty(len(points), np.int64)
+    counts[order] = neighbor_counts(points[order], reach[order])
+    return counts >= config.min_neighbors
+
+
+def _checked_axes(image: SonarImage) -> tuple[FloatArray, FloatArray]:
+    range_m = np.asarray(image.range_m, dtype=np.float64)
+    bearing_rad = np.asarray(image.bearing_rad, dtype=np.float64)
+    if not np.isfinite(range_m).all() or (np.diff(range_m) <= 0.0).any() or range_m[0] < 0.0:
+        raise InvalidInputError("range_m must be finite, not negative, and rise from bin to bin")
+    if not np.isfinite(bearing_rad).all():
+        raise InvalidInputError("bearing_rad holds values that are not finite")
+    if image.intensity.dtype.kind not in "uif":
+        raise InvalidInputError(
+            f"intensity has type {image.intensity.dtype}, expected integers or reals"
+        )
+    return range_m, bearing_rad
+
+
+def _beamwidth(bearing_rad: FloatArray, config: SonarConfig) -> float:
+    if config.beamwidth_rad > 0.0 or len(bearing_rad) < 2:
+        return config.beamwidth_rad or 0.02
+    return float(np.median(np.abs(np.diff(bearing_rad))))
+
+
+def _full_scale(dtype: np.dtype[np.generic]) -> float:
+    # All bits but the sign, which unsigned types do not have.
+    bits = 8 * dtype.itemsize - (dtype.kind == "i")
+    return float(2**bits - 1) if dtype.kind in "ui" else 1.0
+
+
+def _threshold_ratio(
+    power: NDArray[np.float32], full_scale: float, config: SonarConfig
+) -> NDArray[np.float32]:
+    exponent = 2 if config.intensity == "amplitude" else 1
+    floor = (config.min_threshold * full_scale) ** exponent
+    if config.segmentation == "fixed":
+        threshold = max(
+            (config.fixed_threshold * full_scale) ** exponent, np.finfo(np.float32).tiny
+        )
+        return power / np.float32(threshold)
+    if config.segmentation == "adaptive":
+        return row_ratio(power, config.adaptive_factor, floor)
+    num_train, rate = config.num_train_cells, config.false_alarm_rate
+    so_factor = smallest_of_factor(num_train, rate) if config.segmentation == "cfar_soca" else 0.0
+    factors = cell_averaging_factors(2 * num_train, rate)
+    return cfar_ratio(power, num_train, config.num_guard_cells, factors, so_factor, floor)
+
+
+def _polar(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
+    return np.column_stack([range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)])
