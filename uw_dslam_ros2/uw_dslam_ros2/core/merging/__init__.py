@@ -1,1 +1,24 @@
-"""Many submaps to one map: queue, pose graph, consistency, fusion."""
+"""Many submaps of many vehicles, in any order, into one map."""
+
+from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.fusion import Mosaic, Window
+from uw_dslam_ros2.core.merging.queue import MapQueue
+from uw_dslam_ros2.core.merging.types import (
+    Constraint,
+    ConstraintKind,
+    MatchRequest,
+    SubmapRecord,
+    SubmapState,
+)
+
+__all__ = [
+    "Constraint",
+    "ConstraintKind",
+    "MapQueue",
+    "MapQueueConfig",
+    "MatchRequest",
+    "Mosaic",
+    "SubmapRecord",
+    "SubmapState",
+    "Window",
+]

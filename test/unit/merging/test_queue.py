@@ -1,0 +1,228 @@
+"""Properties of the queue, with a matcher that knows the truth."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from unit.merging.fleet import Oracle, map_bytes, refuse, run, three_vehicles
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, SubmapState
+from uw_dslam_ros2.core.se2 import SE2
+
+FLEET = three_vehicles()
+IDS = sorted(FLEET.submaps)
+
+
+def filled(ids=None, config=None, fleet=FLEET) -> MapQueue:
+    queue = MapQueue(config)
+    for submap_id in ids or sorted(fleet.submaps):
+        queue.add_submap(fleet.submaps[submap_id])
+    return queue
+
+
+def test_three_vehicles_become_one_map():
+    queue = filled()
+    oracle = Oracle(FLEET)
+    run(queue, oracle)
+    records = queue.submaps()
+    assert [r.submap.submap_id for r in records] == IDS
+    assert all(r.state is SubmapState.MERGED and r.component == 0 for r in records)
+    assert FLEET.position_error_m(queue) < 0.15
+    assert set(queue.trajectories()) == {"auv_1", "auv_2", "auv_3"}
+    assert oracle.num_asked < len(IDS) * (len(IDS) - 1) / 2
+
+
+def test_each_vehicle_is_one_component_before_any_match():
+    queue = filled()
+    components = {r.submap.vehicle_id: r.component for r in queue.submaps()}
+    assert components == {"auv_1": 0, "auv_2": 1, "auv_3": 2}
+    assert queue.T_map_odom("auv_1") is not None
+    assert queue.T_map_odom("auv_2") is None
+    assert set(queue.trajectories()) == {"auv_1"}
+
+
+def test_refused_vehicles_wait_with_the_reason():
+    queue = filled()
+    run(queue, refuse)
+    waiting = [r for r in queue.submaps() if r.submap.vehicle_id != "auv_1"]
+    assert all(r.state is SubmapState.WAITING for r in waiting)
+    assert all(r.reason == "nothing in common" and r.num_tries > 0 for r in waiting)
+    assert set(queue.trajectories()) == {"auv_1"}
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(order=st.permutations(IDS), batch=st.integers(1, 7))
+def test_any_order_of_arrival_gives_the_same_bytes(order, batch):
+    """Submaps one by one, some answered in between, some twice; the frame is pinned by name."""
+    config = MapQueueConfig(anchor_vehicle="auv_1")
+    straight = filled([i for i in IDS if i[1] == 0] + IDS, config)
+    run(straight, Oracle(FLEET))
+    first = ("auv_1", 0)
+    queue = MapQueue(config)
+    oracle = Oracle(FLEET)
+    queue.add_submap(FLEET.submaps[first])
+    for count, submap_id in enumerate([i for i in order if i != first]):
+        queue.add_submap(FLEET.submaps[submap_id])
+        queue.add_submap(FLEET.submaps[order[0]])
+        if count % batch == 0:
+            for request in reversed(queue.next_requests(2)):
+                queue.add_result(request.request_id, oracle(request))
+    run(queue, oracle, batch)
+    assert map_bytes(queue) == map_bytes(straight)
+
+
+def test_the_same_revision_twice_and_older_ones_change_nothing():
+    queue = filled()
+    run(queue, Oracle(FLEET))
+    before = map_bytes(queue)
+    queue.changed_window()
+    newer = dataclasses.replace(FLEET.submaps["auv_2", 1], revision=1)
+    queue.add_submap(newer)
+    queue.add_submap(FLEET.submaps["auv_2", 1])
+    queue.add_submap(newer)
+    run(queue, Oracle(FLEET))
+    assert map_bytes(queue) == before
+    assert queue.changed_window() is None
+    assert next(r for r in queue.submaps() if r.submap.submap_id == ("auv_2", 1)).submap is newer
+
+
+def test_a_revision_replaces_the_evidence():
+    queue = filled([("auv_1", 0)])
+    submap = FLEET.submaps["auv_1", 0]
+    grid = dataclasses.replace(
+        submap.grid, values=np.where(submap.grid.known, 100, -1).astype("i1")
+    )
+    queue.add_submap(dataclasses.replace(submap, revision=3, grid=grid))
+    fused = queue.global_map().to_occupancy()
+    assert set(np.unique(fused.values) >= 99) == {False, True}
+    assert set(np.unique(fused.values[fused.known]) >= 99) == {True}
+
+
+def test_two_submaps_under_one_name_are_refused():
+    queue = filled([("auv_1", 0)])
+    other = dataclasses.replace(FLEET.submaps["auv_1", 0], T_odom_submap=SE2(1.0, 2.0, 3.0))
+    with pytest.raises(InvalidInputError, match="two vehicles of this name"):
+        queue.add_submap(other)
+
+
+def test_withdrawn_submaps_stay_out_when_sent_again_and_come_back_when_restored():
+    queue = filled()
+    run(queue, Oracle(FLEET))
+    before = map_bytes(queue)
+    assert queue.withdraw(("auv_2", 1))
+    queue.add_submap(dataclasses.replace(FLEET.submaps["auv_2", 1], revision=1))
+    run(queue, Oracle(FLEET))
+    states = {r.submap.submap_id: r.state for r in queue.submaps()}
+    assert [i for i, s in states.items() if s is SubmapState.WITHDRAWN] == [("auv_2", 1)]
+    assert map_bytes(queue) != before
+    assert queue.restore(("auv_2", 1))
+    run(queue, Oracle(FLEET))
+    assert map_bytes(queue) == before
+    assert not queue.withdraw(("auv_9", 0))
+    assert not queue.restore(("auv_9", 0))
+
+
+def test_a_late_vehicle_bridges_two_components():
+    """The outer two share nothing; the middle one comes last."""
+    queue = filled([i for i in IDS if i[0] != "auv_2"])
+    oracle = Oracle(FLEET, min_overlap=0.25)
+    run(queue, oracle)
+    assert {r.submap.vehicle_id: r.component for r in queue.submaps()} == {"auv_1": 0, "auv_3": 1}
+    for submap_id in IDS:
+        if submap_id[0] == "auv_2":
+            queue.add_submap(FLEET.submaps[submap_id])
+    run(queue, oracle)
+    assert {r.component for r in queue.submaps()} == {0}
+
+
+def test_the_lattice_is_pinned_to_the_first_submap_and_never_moves():
+    queue = MapQueue()
+    oracle = Oracle(FLEET)
+    spec = FLEET.submaps["auv_3", 0].grid.spec
+    for submap_id in [("auv_3", 0), *IDS]:
+        queue.add_submap(FLEET.submaps[submap_id])
+        for request in queue.next_requests(1):
+            queue.add_result(request.request_id, oracle(request))
+        fused = queue.global_map()
+        shift = fused.spec.T_frame_grid.as_array() - spec.T_frame_grid.as_array()
+        cells = shift[:2] / spec.resolution_m
+        np.testing.assert_allclose(cells, np.round(cells), atol=1e-9)
+        assert shift[2] == 0.0
+        anchor = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_3", 0))
+        assert anchor.T_component_submap == SE2()
+
+
+def test_a_lone_submap_is_copied_cell_by_cell():
+    queue = filled([("auv_1", 0)])
+    submap = FLEET.submaps["auv_1", 0]
+    fused = queue.global_map().to_occupancy()
+    cells = fused.spec.cells_of(submap.grid.spec.centers_of(np.argwhere(submap.grid.known)))
+    expected = submap.grid.values[submap.grid.known]
+    got = fused.values[cells[:, 0], cells[:, 1]]
+    np.testing.assert_array_equal(got >= 50, expected >= 50)
+    assert np.count_nonzero(fused.known) == len(cells)
+
+
+def test_a_cancelled_request_is_asked_again_and_a_late_answer_is_dropped():
+    queue = filled()
+    first = queue.next_requests(1)[0]
+    assert queue.num_in_flight == 1
+    queue.cancel_request(first.request_id)
+    again = queue.next_requests(1)[0]
+    assert (again.source_ids, again.target_ids) == (first.source_ids, first.target_ids)
+    assert again.request_id != first.request_id
+    queue.add_result(first.request_id, refuse(first))
+    assert queue.num_registrations == 0
+
+
+def test_vehicle_poses_agree_with_the_trajectories():
+    queue = filled()
+    run(queue, Oracle(FLEET))
+    for vehicle, (stamps_ns, poses) in queue.trajectories().items():
+        assert (np.diff(stamps_ns) > 0).all()
+        newest = max(i for i in IDS if i[0] == vehicle)
+        submap = FLEET.submaps[newest]
+        last = queue.T_map_odom(vehicle) @ submap.T_odom_submap
+        expected = last @ SE2.from_array(submap.trajectory[-1])
+        np.testing.assert_allclose(poses[-1], expected.as_array(), atol=1e-9)
+
+
+def test_constraints_tell_kind_and_residual():
+    queue = filled()
+    assert {c.kind for c in queue.constraints()} == {ConstraintKind.ODOMETRY}
+    run(queue, Oracle(FLEET))
+    constraints = queue.constraints()
+    registrations = [c for c in constraints if c.kind is ConstraintKind.REGISTRATION]
+    assert len(registrations) >= 2
+    assert all(c.is_inlier and c.residual_m < 0.5 for c in registrations)
+    assert sum(c.kind is ConstraintKind.ODOMETRY for c in constraints) == len(IDS) - 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"vehicle_id": ""}, "empty vehicle_id"),
+        ({"sequence": -1}, "sequence -1"),
+        ({"covariance": np.full((3, 3), math.nan)}, "covariance is"),
+        ({"covariance": np.diag([1.0, 1.0, -1.0])}, "eigenvalue -1"),
+        ({"covariance": np.eye(2)}, "expected \\(3, 3\\)"),
+        ({"trajectory": np.zeros((1, 3))}, "trajectory has shape"),
+        ({"trajectory": np.full((2, 3), math.inf)}, "trajectory holds"),
+    ],
+)
+def test_nonsense_is_refused_by_name(changes, sentence):
+    queue = MapQueue()
+    with pytest.raises(InvalidInputError, match=sentence):
+        queue.add_submap(dataclasses.replace(FLEET.submaps["auv_1", 0], **changes))
+    assert queue.submaps() == []
+    assert queue.global_map() is None
+
+
+def test_a_grid_that_is_too_large_is_refused():
+    queue = MapQueue(MapQueueConfig(max_submap_cells=100))
+    with pytest.raises(InvalidInputError, match="expected at most 100"):
+        queue.add_submap(FLEET.submaps["auv_1", 0])

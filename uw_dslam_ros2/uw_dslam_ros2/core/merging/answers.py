@@ -1,0 +1,94 @@
+"""Matches that the queue wants, and the answers it has had."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.mapping.submap import SubmapId
+from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance
+from uw_dslam_ros2.core.merging.units import StoredSubmap, Unit, shared_area_m2
+from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
+from uw_dslam_ros2.core.se2 import SE2, wrap_angle
+
+__all__ = ["Answer", "Match", "MatchKey", "edge_of"]
+
+FloatArray = NDArray[np.float64]
+
+MatchKey = tuple[bytes, bytes, tuple[float, ...]]
+"""Source unit, target unit, prior: equal keys are the same question and get the same answer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """A question: where the source lies in the target."""
+
+    source: Unit
+    target: Unit
+    prior: PriorWindow | None = None
+
+    @property
+    def key(self) -> MatchKey:
+        """What makes two questions the same."""
+        return self.source.key, self.target.key, _prior_key(self.prior)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What is kept of a `RegistrationResult`, with the question."""
+
+    match: Match
+    verdict: Verdict
+    reason: str
+    T_target_source: SE2
+    covariance: FloatArray
+    probability: float
+
+    @property
+    def is_accepted(self) -> bool:
+        """Accepted, and where a window was asked for, inside it."""
+        if self.verdict is not Verdict.ACCEPTED:
+            return False
+        prior = self.match.prior
+        if prior is None:
+            return True
+        guess, found = prior.T_target_source, self.T_target_source
+        # A refinement may step over the border by a little.
+        return (
+            abs(found.x - guess.x) <= 1.1 * prior.half_width_m
+            and abs(found.y - guess.y) <= 1.1 * prior.half_width_m
+            and abs(wrap_angle(found.yaw - guess.yaw)) <= 1.1 * prior.half_width_rad
+        )
+
+
+def edge_of(
+    answer: Answer,
+    submaps: dict[SubmapId, StoredSubmap],
+    sigma_floor_m: float,
+    sigma_floor_rad: float,
+) -> Edge:
+    """Turn a match of two units into an edge between the two submaps that share most of it."""
+    source, target = answer.match.source, answer.match.target
+    T_target_source = answer.T_target_source
+    best: tuple[float, SubmapId, SubmapId] | None = None
+    for source_id, T_source_submap in source.T_reference_submap.items():
+        for target_id, T_target_submap in target.T_reference_submap.items():
+            T_between = T_target_submap.inverse() @ T_target_source @ T_source_submap
+            area = shared_area_m2(submaps[source_id], submaps[target_id], T_between)
+            if best is None or area > best[0]:
+                best = area, source_id, target_id
+    assert best is not None
+    _, source_id, target_id = best
+    left = target.T_reference_submap[target_id].inverse()
+    right = source.T_reference_submap[source_id]
+    floor = np.diag([sigma_floor_m**2, sigma_floor_m**2, sigma_floor_rad**2])
+    covariance = compose_covariance(answer.covariance, left, T_target_source, right) + floor
+    return Edge(source_id, target_id, left @ T_target_source @ right, covariance)
+
+
+def _prior_key(prior: PriorWindow | None) -> tuple[float, ...]:
+    if prior is None:
+        return ()
+    return (*prior.T_target_source.as_array().tolist(), prior.half_width_m, prior.half_width_rad)

@@ -1,0 +1,351 @@
+"""The map queue: submaps in, questions out, answers in, one global map out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
+from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
+from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
+from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
+from uw_dslam_ros2.core.merging.graph import residual
+from uw_dslam_ros2.core.merging.plan import Plan, make_plan
+from uw_dslam_ros2.core.merging.types import (
+    Constraint,
+    ConstraintKind,
+    MatchRequest,
+    SubmapRecord,
+    SubmapState,
+)
+from uw_dslam_ros2.core.merging.units import StoredSubmap, render_unit
+from uw_dslam_ros2.core.registration.result import RegistrationResult
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["MapQueue"]
+
+_UNIT_LOG_ODDS_MAX = 8.0
+
+
+class MapQueue:
+    """Collects the submaps of all vehicles and says which maps to register next.
+
+    Sans-IO: the caller carries the requests to registration servers and brings back the results,
+    in any order and at any time. The global frame "map" is the frame of the first submap that
+    came in (or of the first one of ``config.anchor_vehicle``) and never moves; that submap's
+    cells are the lattice of the global map.
+    """
+
+    def __init__(self, config: MapQueueConfig | None = None) -> None:
+        self._config = config or MapQueueConfig()
+        self._submaps: dict[SubmapId, StoredSubmap] = {}
+        self._withdrawn: set[SubmapId] = set()
+        self._anchor: SubmapId | None = None
+        self._answers: dict[MatchKey, Answer] = {}
+        self._in_flight: dict[int, Match] = {}
+        self._next_request_id = 1
+        self._plan_cache: Plan | None = None
+        self._lattice: GridSpec | None = None
+        self._mosaic: Mosaic | None = None
+        self._is_drawn = False
+
+    def add_submap(self, submap: Submap) -> None:
+        """Take a submap; a higher revision replaces, an equal or lower one changes nothing.
+
+        Raises
+        ------
+        InvalidInputError
+            Naming the submap, the field, its value and what was expected; also for two different
+            submaps of one name and revision, which is what two vehicles of the same name send.
+        """
+        stored = StoredSubmap.of(submap, self._config.max_submap_cells)
+        held = self._submaps.get(submap.submap_id)
+        if held is not None and submap.revision <= held.submap.revision:
+            is_other = held.fingerprint != stored.fingerprint
+            if submap.revision == held.submap.revision and is_other:
+                raise InvalidInputError(
+                    f"submap {submap.vehicle_id}/{submap.sequence} revision {submap.revision} "
+                    "differs from the one received before: are there two vehicles of this name?"
+                )
+            return
+        self._submaps[submap.submap_id] = stored
+        wanted = self._config.anchor_vehicle
+        if self._anchor is None and wanted in ("", submap.vehicle_id):
+            self._anchor = submap.submap_id
+            self._lattice = self._lattice_of(submap.grid.spec)
+        self._change()
+
+    def next_requests(self, max_requests: int) -> list[MatchRequest]:
+        """Give up to so many registrations to ask for now, most useful first.
+
+        Each stays in flight until `add_result` or `cancel_request`.
+        """
+        asked = {match.key for match in self._in_flight.values()}
+        requests: list[MatchRequest] = []
+        for match in self._plan().wanted:
+            if len(requests) >= max_requests:
+                break
+            if match.key not in asked:
+                asked.add(match.key)
+                requests.append(self._request(match))
+        return requests
+
+    def add_result(self, request_id: int, result: RegistrationResult) -> None:
+        """Take the answer to a request; one that is not in flight changes nothing."""
+        match = self._in_flight.pop(request_id, None)
+        if match is None:
+            return
+        covariance = np.array(result.covariance, dtype=np.float64)
+        self._answers[match.key] = Answer(
+            match,
+            result.verdict,
+            result.reason,
+            result.T_target_source,
+            covariance,
+            result.probability,
+        )
+        self._change()
+
+    def cancel_request(self, request_id: int) -> None:
+        """Forget that a request was asked (its server died); it will be asked again."""
+        self._in_flight.pop(request_id, None)
+
+    @property
+    def num_in_flight(self) -> int:
+        """Requests asked and not answered yet."""
+        return len(self._in_flight)
+
+    @property
+    def num_registrations(self) -> int:
+        """Answers had so far."""
+        return len(self._answers)
+
+    def withdraw(self, submap_id: SubmapId) -> bool:
+        """Take a submap out of the map and out of matching until `restore`, also when sent again.
+
+        False if there is no such submap.
+        """
+        if submap_id not in self._submaps:
+            return False
+        if submap_id not in self._withdrawn:
+            self._withdrawn.add(submap_id)
+            self._change()
+        return True
+
+    def restore(self, submap_id: SubmapId) -> bool:
+        """Undo `withdraw`. False if there is no such submap."""
+        if submap_id not in self._submaps:
+            return False
+        if submap_id in self._withdrawn:
+            self._withdrawn.discard(submap_id)
+            self._change()
+        return True
+
+    def submaps(self) -> list[SubmapRecord]:
+        """All submaps, by vehicle and sequence."""
+        plan = self._plan()
+        place: dict[SubmapId, tuple[int, SE2]] = {}
+        first = 0 if self._anchor is not None else 1
+        for index, component in enumerate(plan.components, start=first):
+            place |= {submap_id: (index, motion) for submap_id, motion in component.items()}
+        tries = self._num_tries()
+        return [
+            self._record(submap_id, *place[submap_id], tries.get(submap_id[0], 0))
+            for submap_id in sorted(self._submaps)
+        ]
+
+    def constraints(self) -> list[Constraint]:
+        """All edges of the pose graph with what is left of them after optimisation."""
+        plan = self._plan()
+        where = {i: n for n, component in enumerate(plan.components) for i in component}
+        found: list[Constraint] = []
+        edges = [(ConstraintKind.ODOMETRY, edge, True) for edge in plan.odometry]
+        edges += [(ConstraintKind.REGISTRATION, j.edge, j.is_inlier) for j in plan.joints]
+        for kind, edge, is_inlier in edges:
+            is_joined = where[edge.source] == where[edge.target]
+            poses = plan.components[where[edge.source]] if is_joined else {}
+            found.append(
+                Constraint(
+                    kind,
+                    edge.source,
+                    edge.target,
+                    edge.T_target_source,
+                    edge.covariance,
+                    *residual(edge, poses),
+                    is_inlier,
+                )
+            )
+        return found
+
+    def global_map(self) -> EvidenceGrid | None:
+        """The fused map in frame "map"; None before there is any evidence."""
+        mosaic = self._drawn()
+        return None if mosaic is None else mosaic.evidence()
+
+    def changed_window(self) -> tuple[GridSpec, Window] | None:
+        """What changed in the global map since the last call, or None.
+
+        The rectangle's place as a grid, and the rectangle in cells of the pinned lattice.
+        """
+        mosaic = self._drawn()
+        window = None if mosaic is None else mosaic.take_changed()
+        if mosaic is None or window is None:
+            return None
+        return mosaic.spec_of(window), window
+
+    def T_map_odom(self, vehicle_id: str) -> SE2 | None:  # noqa: N802 (notation of motions)
+        """Place of a vehicle's odom frame, from its newest submap; None unless it is merged."""
+        merged = self._merged()
+        newest = max((i for i in merged if i[0] == vehicle_id), default=None)
+        if newest is None:
+            return None
+        return merged[newest] @ self._submaps[newest].submap.T_odom_submap.inverse()
+
+    def trajectories(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """Of each merged vehicle: stamps (K,) [ns] and poses (K, 3) [x, y, yaw] in "map"."""
+        merged = self._merged()
+        parts: dict[str, list[tuple[NDArray[np.int64], NDArray[np.float64]]]] = {}
+        for submap_id in sorted(merged):
+            submap = self._submaps[submap_id].submap
+            if len(submap.trajectory):
+                poses = _moved(merged[submap_id], submap.trajectory)
+                parts.setdefault(submap_id[0], []).append((submap.trajectory_stamp_ns, poses))
+        return {vehicle: _by_time(pieces) for vehicle, pieces in parts.items()}
+
+    def _merged(self) -> dict[SubmapId, SE2]:
+        return self._plan().components[0] if self._anchor is not None else {}
+
+    def _change(self) -> None:
+        self._plan_cache = None
+        self._is_drawn = False
+
+    def _plan(self) -> Plan:
+        if self._plan_cache is None:
+            if not self._submaps:
+                return Plan([], [], [], [])
+            self._plan_cache = make_plan(
+                self._submaps,
+                frozenset(self._withdrawn),
+                self._anchor or min(self._submaps),
+                self._answers,
+                self._config,
+            )
+        return self._plan_cache
+
+    def _request(self, match: Match) -> MatchRequest:
+        request_id = self._next_request_id
+        self._next_request_id += 1
+        self._in_flight[request_id] = match
+        source = render_unit(match.source, self._submaps, _UNIT_LOG_ODDS_MAX)
+        target = render_unit(match.target, self._submaps, _UNIT_LOG_ODDS_MAX)
+        assert source is not None
+        assert target is not None
+        return MatchRequest(
+            request_id,
+            source,
+            target,
+            match.prior,
+            match.source.ids,
+            match.target.ids,
+            match.source.reference,
+            match.target.reference,
+        )
+
+    def _record(
+        self, submap_id: SubmapId, component: int, T_component_submap: SE2, num_tries: int
+    ) -> SubmapRecord:
+        submap = self._submaps[submap_id].submap
+        if submap_id in self._withdrawn:
+            state, reason = SubmapState.WITHDRAWN, "taken out by a person"
+        elif component == 0:
+            state, reason = SubmapState.MERGED, self._merge_reason(submap_id)
+        else:
+            state, reason = SubmapState.WAITING, self._wait_reason(submap_id[0])
+        return SubmapRecord(submap, state, component, T_component_submap, num_tries, reason)
+
+    def _merge_reason(self, submap_id: SubmapId) -> str:
+        assert self._anchor is not None
+        if submap_id == self._anchor:
+            return "pins the global frame"
+        if submap_id[0] == self._anchor[0]:
+            return "odometry from the submap that pins the global frame"
+        partners = sorted(
+            {
+                j.edge.target[0] if j.edge.source[0] == submap_id[0] else j.edge.source[0]
+                for j in self._plan().joints
+                if j.is_inlier and submap_id[0] in (j.edge.source[0], j.edge.target[0])
+            }
+        )
+        return f"registered with {', '.join(partners)}"
+
+    def _wait_reason(self, vehicle: str) -> str:
+        reasons = [
+            answer.reason
+            for answer in self._answers.values()
+            if not answer.is_accepted
+            and vehicle in (answer.match.source.reference[0], answer.match.target.reference[0])
+        ]
+        return reasons[-1] if reasons else "not matched yet"
+
+    def _num_tries(self) -> dict[str, int]:
+        tries: dict[str, int] = {}
+        for answer in self._answers.values():
+            for unit in (answer.match.source, answer.match.target):
+                for vehicle in {submap_id[0] for submap_id in unit.ids}:
+                    tries[vehicle] = tries.get(vehicle, 0) + 1
+        return tries
+
+    def _drawn(self) -> Mosaic | None:
+        """The mosaic, up to date: draws only what is new or has moved."""
+        if self._lattice is None:
+            return None
+        if self._mosaic is None:
+            self._mosaic = Mosaic(self._lattice, self._config.log_odds_max)
+        mosaic = self._mosaic
+        if not self._is_drawn:
+            shown = {i: T for i, T in self._merged().items() if i not in self._withdrawn}
+            for key in [key for key in mosaic.keys() if key not in shown]:  # noqa: SIM118
+                mosaic.remove(key)
+            for submap_id, motion in shown.items():
+                stored = self._submaps[submap_id]
+                snapped = snap_pose(motion, mosaic.lattice.resolution_m, stored.radius_m)
+                version = (stored.digest, snapped)
+                if mosaic.version_of(submap_id) != version:
+                    patch = render_patch(mosaic.lattice, stored.submap.grid, snapped)
+                    mosaic.put(submap_id, version, patch)
+            self._is_drawn = True
+        return mosaic
+
+    def _lattice_of(self, spec: GridSpec) -> GridSpec:
+        """Cells of the pinning submap, reduced to the cell at its frame's origin.
+
+        A later revision that has grown by whole cells means the same lattice.
+        """
+        resolution_m = self._config.resolution_m or spec.resolution_m
+        turn = SE2(0.0, 0.0, spec.T_frame_grid.yaw)
+        corner = turn.inverse().apply(spec.T_frame_grid.as_array()[:2]) / resolution_m
+        phase = np.round(corner - np.floor(corner + 1e-6), 9) * resolution_m
+        return GridSpec(resolution_m, 1, 1, turn @ SE2(float(phase[0]), float(phase[1])))
+
+
+def _moved(motion: SE2, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    moved = np.empty_like(poses)
+    moved[:, :2] = motion.apply(poses[:, :2])
+    moved[:, 2] = (poses[:, 2] + motion.yaw + math.pi) % (2.0 * math.pi) - math.pi
+    return moved
+
+
+def _by_time(
+    pieces: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    stamps, poses = (np.concatenate(part) for part in zip(*pieces, strict=True))
+    # A ping at the seam belongs to two submaps: the later one's word counts.
+    order = np.argsort(stamps, kind="stable")
+    stamps, poses = stamps[order], poses[order]
+    is_last = np.append(np.diff(stamps) > 0, True)
+    return stamps[is_last], poses[is_last]

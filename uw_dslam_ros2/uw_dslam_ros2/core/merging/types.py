@@ -1,0 +1,81 @@
+"""What goes in and out of the map queue."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
+from uw_dslam_ros2.core.registration.result import PriorWindow
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["Constraint", "ConstraintKind", "MatchRequest", "SubmapRecord", "SubmapState"]
+
+FloatArray = NDArray[np.float64]
+
+
+class SubmapState(enum.IntEnum):
+    """Where a submap is; the numbers are those of ``uw_dslam_msgs/SubmapInfo``."""
+
+    WAITING = 1
+    MERGED = 2
+    WITHDRAWN = 3
+
+
+class ConstraintKind(enum.IntEnum):
+    """What an edge comes from; the numbers are those of ``uw_dslam_msgs/Constraint``."""
+
+    ODOMETRY = 1
+    REGISTRATION = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchRequest:
+    """One registration that the queue asks for; answer it through ``MapQueue.add_result``.
+
+    The maps are fused from the submaps named in ``source_ids`` and ``target_ids``; each map's
+    frame is that of its ``*_reference`` submap.
+    """
+
+    request_id: int
+    source: OccupancyMap
+    target: OccupancyMap
+    prior: PriorWindow | None
+    source_ids: tuple[SubmapId, ...]
+    target_ids: tuple[SubmapId, ...]
+    source_reference: SubmapId
+    target_reference: SubmapId
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SubmapRecord:
+    """What the queue knows of one submap; as in ``uw_dslam_msgs/SubmapInfo``."""
+
+    submap: Submap
+    state: SubmapState
+    component: int  # submaps with the same number share one frame; 0 is the global map's
+    T_component_submap: SE2  # in "map" for component 0
+    num_tries: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Constraint:
+    """One edge of the pose graph; as in ``uw_dslam_msgs/Constraint``.
+
+    ``covariance`` (3, 3) of x [m], y [m], yaw [rad] in the target's frame. The residuals compare
+    the measured with the optimised motion; they are NaN while the two submaps share no frame.
+    """
+
+    kind: ConstraintKind
+    source: SubmapId
+    target: SubmapId
+    T_target_source: SE2
+    covariance: FloatArray
+    residual_m: float
+    residual_rad: float
+    is_inlier: bool

@@ -1,0 +1,171 @@
+"""What is matched: maps fused from several submaps.
+
+One short submap overlaps little with another; a map of neighbouring submaps gives the
+registration more to hold on to.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
+from uw_dslam_ros2.core.merging.fusion import fuse_maps
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["StoredSubmap", "Unit", "render_unit", "shared_area_m2"]
+
+FloatArray = NDArray[np.float64]
+
+_MAX_FOOTPRINT_POINTS = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredSubmap:
+    """A submap, checked, with what is often asked of it."""
+
+    submap: Submap
+    digest: bytes
+    """Of the grid's content and place: equal grids match equally."""
+    fingerprint: bytes
+    """Of everything: tells a message sent twice from two messages under one name."""
+    footprint: FloatArray
+    """(K, 2) [m] in the submap's frame: known cells, evenly thinned."""
+    area_per_point_m2: float
+    radius_m: float
+    """Farthest known cell from the submap's origin."""
+
+    @classmethod
+    def of(cls, submap: Submap, max_cells: int) -> StoredSubmap:
+        """Check a submap.
+
+        Raises
+        ------
+        InvalidInputError
+            Naming the submap, the field, its value, and what was expected.
+        """
+        _check(submap, max_cells)
+        spec, values = submap.grid.spec, submap.grid.values
+        header = np.array([spec.resolution_m, *spec.shape, *spec.T_frame_grid.as_array()])
+        digest = hashlib.blake2b(header.tobytes() + values.tobytes(), digest_size=16)
+        everything = digest.copy()
+        for part in (
+            np.array([*submap.T_odom_submap.as_array(), submap.is_final, submap.stamp_ns]),
+            np.asarray(submap.covariance, dtype=np.float64),
+            np.asarray(submap.trajectory, dtype=np.float64),
+        ):
+            everything.update(np.ascontiguousarray(part).tobytes())
+        cells = np.argwhere(submap.grid.known)
+        kept, share = _thinned(cells)
+        footprint = spec.centers_of(kept) if len(kept) else np.empty((0, 2))
+        radius_m = float(np.hypot(*footprint.T).max()) if len(kept) else 0.0
+        area = spec.resolution_m**2 * share
+        return cls(submap, digest.digest(), everything.digest(), footprint, area, radius_m)
+
+    @property
+    def area_m2(self) -> float:
+        """Known area."""
+        return len(self.footprint) * self.area_per_point_m2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unit:
+    """Submaps placed in the frame of one of them, the reference."""
+
+    reference: SubmapId
+    T_reference_submap: dict[SubmapId, SE2]
+    key: bytes = field(default=b"")
+
+    @classmethod
+    def of(
+        cls, members: Sequence[StoredSubmap], T_frame_submap: Sequence[SE2], reference: int
+    ) -> Unit:
+        """Place members by poses in any common frame; `reference` is an index."""
+        T_reference_frame = T_frame_submap[reference].inverse()
+        poses: dict[SubmapId, SE2] = {}
+        hasher = hashlib.blake2b(digest_size=16)
+        for index, (member, motion) in enumerate(zip(members, T_frame_submap, strict=True)):
+            # Exactly nothing for the reference itself; elsewhere rounding errors are cut off.
+            relative = SE2() if index == reference else T_reference_frame @ motion
+            rounded = SE2.from_array(np.round(relative.as_array(), 6))
+            poses[member.submap.submap_id] = rounded
+            hasher.update(repr((member.submap.submap_id, rounded)).encode() + member.digest)
+        reference_id = members[reference].submap.submap_id
+        hasher.update(repr(reference_id).encode())
+        return cls(reference_id, poses, hasher.digest())
+
+    @property
+    def ids(self) -> tuple[SubmapId, ...]:
+        """Members, in order."""
+        return tuple(self.T_reference_submap)
+
+
+def render_unit(
+    unit: Unit, submaps: dict[SubmapId, StoredSubmap], log_odds_max: float
+) -> OccupancyMap | None:
+    """Fuse a unit's submaps on the lattice of its reference; None where nothing was seen."""
+    spec = submaps[unit.reference].submap.grid.spec
+    lattice = GridSpec(spec.resolution_m, 1, 1, spec.T_frame_grid)
+    placed = [(submaps[i].submap.grid, T) for i, T in unit.T_reference_submap.items()]
+    return fuse_maps(lattice, placed, log_odds_max)
+
+
+def shared_area_m2(source: StoredSubmap, target: StoredSubmap, T_target_source: SE2) -> float:
+    """Area [m^2] that both submaps have seen."""
+    if len(source.footprint) == 0 or len(target.footprint) == 0:
+        return 0.0
+    reach = source.radius_m + target.radius_m
+    if T_target_source.x**2 + T_target_source.y**2 > reach**2:
+        return 0.0
+    grid = target.submap.grid
+    cells = grid.spec.cells_of(T_target_source.apply(source.footprint))
+    cells = cells[grid.spec.contains(cells)]
+    return float(np.count_nonzero(grid.values[cells[:, 0], cells[:, 1]] >= 0)) * (
+        source.area_per_point_m2
+    )
+
+
+def _thinned(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+    """Cells on a coarser grid, and how many original ones each stands for."""
+    if len(cells) <= _MAX_FOOTPRINT_POINTS:
+        return cells, 1.0
+    step = int(np.ceil(np.sqrt(len(cells) / _MAX_FOOTPRINT_POINTS)))
+    kept = cells[((cells + step // 2) % step == 0).all(axis=1)]
+    if len(kept) == 0:
+        kept = cells[:: len(cells) // _MAX_FOOTPRINT_POINTS]
+    return kept, len(cells) / len(kept)
+
+
+def _check(submap: Submap, max_cells: int) -> None:
+    name = f"submap {submap.vehicle_id}/{submap.sequence}"
+    if not submap.vehicle_id:
+        raise InvalidInputError("submap has an empty vehicle_id, expected the vehicle's name")
+    if submap.sequence < 0 or submap.revision < 0:
+        raise InvalidInputError(
+            f"{name}: sequence {submap.sequence}, revision {submap.revision}, expected >= 0"
+        )
+    covariance = np.asarray(submap.covariance)
+    if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
+        raise InvalidInputError(f"{name}: covariance is {covariance}, expected (3, 3) finite")
+    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12):
+        raise InvalidInputError(f"{name}: covariance is {covariance}, expected symmetric")
+    lowest = float(np.linalg.eigvalsh(covariance)[0])
+    if lowest < -1e-9 * max(1.0, float(np.abs(covariance).max())):
+        raise InvalidInputError(f"{name}: covariance has eigenvalue {lowest:g}, expected >= 0")
+    if submap.grid.values.size > max_cells:
+        raise InvalidInputError(
+            f"{name}: the grid has {submap.grid.values.size} cells, expected at most {max_cells}"
+        )
+    shape, stamps = np.shape(submap.trajectory), np.shape(submap.trajectory_stamp_ns)
+    if len(shape) != 2 or shape[1] != 3 or stamps != shape[:1]:
+        raise InvalidInputError(
+            f"{name}: trajectory has shape {shape} and its stamps {stamps}, expected (K, 3), (K,)"
+        )
+    if not np.isfinite(submap.trajectory).all():
+        raise InvalidInputError(f"{name}: trajectory holds a value that is not finite")
