@@ -1,0 +1,246 @@
+"""Settings files: the layout of ROS parameter files, so that one file serves nodes and commands.
+
+::
+
+    /**:                              # every node; or one by its full name: /auv_1/sonar_mapper:
+      ros__parameters:
+        mapper:                       # one group of settings, see `SECTIONS`
+          submap:
+            max_length_m: 25.0        # or, in one piece, mapper.submap.max_length_m: 25.0
+
+The groups may also stand at the top of the file, without the two lines above them. What is said
+to one node wins over ``/**``, as in ROS.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from uw_dslam_ros2.core.config import Config
+from uw_dslam_ros2.core.errors import ConfigError
+
+__all__ = ["NODES", "SECTIONS", "SettingsFile"]
+
+SECTIONS = ("mapper", "registration", "points", "queue")
+"""Groups of settings that are part of the core; everything else concerns a node alone."""
+
+NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
+_EVERY_NODE = "/**"
+_PARAMETERS = "ros__parameters"
+
+_Tree = dict[str, Any]
+
+
+class SettingsFile:
+    """The content of a settings file, checked for its shape.
+
+    Parameters
+    ----------
+    path
+        A YAML file; None stands for an empty one, so that every setting has its default.
+
+    Raises
+    ------
+    ConfigError
+        Naming the file, the key, its value and what was expected.
+    """
+
+    def __init__(self, path: str | Path | None) -> None:
+        self.path = None if path is None else Path(path)
+        content = {} if self.path is None else _load(self.path)
+        self._parts = _split(self._label, content)
+
+    @property
+    def _label(self) -> str:
+        return "settings" if self.path is None else str(self.path)
+
+    def section[ConfigT: Config](
+        self, config_type: type[ConfigT], section: str, node: str
+    ) -> ConfigT:
+        """One group of settings as a node with a full name such as ``/auv_1/sonar_mapper`` has it.
+
+        Raises
+        ------
+        ConfigError
+            If a key is unknown, or a value has the wrong type or is out of its range.
+        """
+        merged: _Tree = {}
+        for pattern, values in self._parts:
+            if _matches(pattern, node) and section in values:
+                _check_types(self._label, section, config_type, values[section])
+                merged = _merge(merged, values[section])
+        try:
+            return config_type.from_dict(merged)
+        except ConfigError as error:
+            raise ConfigError(f"{self._label}: {section}: {error}") from error
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is there twice: YAML would silently drop the first."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} is there twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def _load(path: Path) -> _Tree:
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror or error}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
+    if content is None:
+        return {}
+    return _mapping(str(path), "the file", content)
+
+
+def _split(label: str, content: _Tree) -> list[tuple[str, _Tree]]:
+    """``(node pattern, nested values)``, the most general pattern first."""
+    plain = {key: value for key, value in content.items() if key.split(".")[0] in SECTIONS}
+    parts = [(_EVERY_NODE, _nested(label, "", plain))] if plain else []
+    for key, value in content.items():
+        if key in plain:
+            continue
+        for pattern, values in _node_parts(label, key, value):
+            _check_pattern(label, pattern)
+            parts.append((pattern, _nested(label, f"{pattern}: ", values)))
+    for pattern, values in parts:
+        _check_heads(label, pattern, values)
+    return sorted(parts, key=lambda part: part[0] != _EVERY_NODE)
+
+
+def _node_parts(label: str, key: str, value: Any) -> list[tuple[str, _Tree]]:
+    """ROS allows namespaces to be nested: ``auv_1: {sonar_mapper: {ros__parameters: ...}}``."""
+    if not isinstance(value, Mapping):
+        close = _nearest(key.split(".")[0], (*SECTIONS, *NODES))
+        raise ConfigError(
+            f"{label}: {key} is {value!r}; expected a group ({', '.join(SECTIONS)}) or a node "
+            f"with {_PARAMETERS}{close}"
+        )
+    value = _mapping(label, key, value)
+    if _PARAMETERS in value:
+        if others := sorted(set(value) - {_PARAMETERS}):
+            raise ConfigError(f"{label}: {key} has {others[0]!r} beside {_PARAMETERS}")
+        return [(key, _mapping(label, f"{key}: {_PARAMETERS}", value[_PARAMETERS] or {}))]
+    if not any(isinstance(inner, Mapping) for inner in value.values()):
+        close = _nearest(key.rsplit("/", 1)[-1], (*SECTIONS, *NODES, _PARAMETERS))
+        raise ConfigError(
+            f"{label}: {key!r} is neither a group of settings ({', '.join(SECTIONS)}) nor a node "
+            f"with {_PARAMETERS}{close}"
+        )
+    found = []
+    for name, inner in value.items():
+        found += _node_parts(label, f"{key.rstrip('/')}/{name.lstrip('/')}", inner)
+    return found
+
+
+def _mapping(label: str, key: str, value: Any) -> _Tree:
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{label}: {key} is {value!r}, expected keys with values")
+    if strange := [name for name in value if not isinstance(name, str)]:
+        raise ConfigError(f"{label}: {key} has the key {strange[0]!r}, expected a name")
+    return dict(value)
+
+
+def _nested(label: str, where: str, values: _Tree) -> _Tree:
+    """Undo dotted names."""
+    result: _Tree = {}
+    for key, value in values.items():
+        is_group = isinstance(value, Mapping)
+        inner: Any = _nested(label, f"{where}{key}.", dict(value)) if is_group else value
+        for part in reversed(key.split(".")):
+            inner = {part: inner}
+        result = _merge(result, inner)
+    return result
+
+
+def _merge(base: _Tree, over: _Tree) -> _Tree:
+    result = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(result.get(key), dict)
+        result[key] = _merge(result[key], value) if both else value
+    return result
+
+
+def _check_pattern(label: str, pattern: str) -> None:
+    name = pattern.rsplit("/", 1)[-1]
+    if pattern == _EVERY_NODE:
+        return
+    if "*" in pattern:
+        raise ConfigError(
+            f"{label}: {pattern!r} would match no node: expected {_EVERY_NODE} or a full name "
+            "such as /auv_1/sonar_mapper"
+        )
+    if name not in NODES:
+        raise ConfigError(
+            f"{label}: {pattern!r} is no node of this package; there are {', '.join(NODES)}"
+            f"{_nearest(name, NODES)}"
+        )
+
+
+def _check_heads(label: str, pattern: str, values: _Tree) -> None:
+    """A group with a typing error would be taken for a parameter of a node, and be lost."""
+    for key, value in values.items():
+        if isinstance(value, dict) and key not in SECTIONS and key != "qos_overrides":
+            raise ConfigError(
+                f"{label}: {pattern}: {key!r} is no group of settings; there are "
+                f"{', '.join(SECTIONS)}{_nearest(key, SECTIONS)}"
+            )
+
+
+def _check_types(label: str, name: str, config_type: type[Config], values: Any) -> None:
+    """What rclpy would refuse is refused here too, so that a file is right or wrong for both."""
+    for key, value in _mapping(label, name, values).items():
+        field = next((field for field in fields(config_type) if field.name == key), None)
+        if field is None:
+            known = [field.name for field in fields(config_type)]
+            raise ConfigError(
+                f"{label}: {name}.{key} is unknown; {name} has {', '.join(known)}"
+                f"{_nearest(key, known)}"
+            )
+        default = field.default
+        if isinstance(default, Config):
+            _check_types(label, f"{name}.{key}", type(default), value)
+        elif isinstance(default, float) and type(value) is int:
+            raise ConfigError(
+                f"{label}: {name}.{key} is {value}, an integer, expected a float: write {value}.0"
+            )
+        elif not isinstance(default, tuple) and type(value) is not type(default):
+            raise ConfigError(
+                f"{label}: {name}.{key} is {value!r} ({type(value).__name__}), "
+                f"expected {type(default).__name__}: {field.metadata.get('doc', '')}"
+            )
+        else:
+            _check_value(label, name, config_type, key, value)
+
+
+def _check_value(label: str, name: str, config_type: type[Config], key: str, value: Any) -> None:
+    try:
+        config_type(**{key: value})
+    except ConfigError as error:
+        reason = str(error).removeprefix(f"{config_type.__name__}.{key} ")
+        raise ConfigError(f"{label}: {name}.{key} {reason}") from error
+
+
+def _nearest(name: str, known: tuple[str, ...] | list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _matches(pattern: str, node: str) -> bool:
+    """As rclpy does: ``/**``, or the node's full name (with or without the first slash)."""
+    return pattern == _EVERY_NODE or "/" + pattern.strip("/") == node
