@@ -1,0 +1,51 @@
+"""The study command: every study is offered, and what it writes can be read."""
+
+import csv
+from itertools import pairwise
+
+import pytest
+
+from uw_dslam_ros2.cli.study import build_parser, main, study_names
+
+
+def test_every_study_has_help(capsys):
+    assert "convergence" in study_names()
+    for name in study_names():
+        with pytest.raises(SystemExit) as stopped:
+            build_parser().parse_args([name.replace("_", "-"), "--help"])
+        assert stopped.value.code == 0
+        assert "--out" in capsys.readouterr().out
+
+
+def test_unknown_study_is_refused(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["nothing"])
+    assert stopped.value.code == 2
+    assert "convergence" in capsys.readouterr().err
+
+
+def test_convergence_traces_close_in(tmp_path, capsys):
+    arguments = ["--points", "8", "--sigma", "0.2", "--gap", "0.05"]
+    assert main(["convergence", "--out", str(tmp_path / "new"), *arguments]) == 0
+    assert (tmp_path / "new" / "convergence.png").read_bytes()[:4] == b"\x89PNG"
+    with (tmp_path / "new" / "convergence.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    searches = {row["search"] for row in rows}
+    assert len(searches) == 3
+    optimum = {}
+    for search in searches:
+        lower = [float(row["lower"]) for row in rows if row["search"] == search]
+        upper = [float(row["upper"]) for row in rows if row["search"] == search]
+        assert all(a <= b for a, b in pairwise(lower))
+        assert all(a >= b for a, b in pairwise(upper))
+        optimum[search] = (lower[-1], upper[-1])
+    # The engine and the reference enclose the same optimum.
+    reference, engine = optimum["reference, N = 1"], optimum["engine"]
+    assert max(reference[0], engine[0]) <= min(reference[1], engine[1])
+    assert "| engine" in capsys.readouterr().out
+
+
+def test_output_that_cannot_be_written_is_an_error(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["convergence", "--out", str(tmp_path / "file" / "below")]) == 1
+    assert "cannot write" in capsys.readouterr().err
