@@ -267,7 +267,7 @@ def compare_maps(
 
 
 def map_sharpness(occupancy: OccupancyMap) -> MapSharpness:
-    """Measure a map by itself: misplaced submaps blur walls, double them and contradict each other.
+    """Measure a map by itself: misplaced submaps blur walls, double them, contradict each other.
 
     Returns
     -------

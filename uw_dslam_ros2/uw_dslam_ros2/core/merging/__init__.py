@@ -3,6 +3,7 @@
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Mosaic, Window
 from uw_dslam_ros2.core.merging.queue import MapQueue
+from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,
@@ -18,6 +19,7 @@ __all__ = [
     "MapQueueConfig",
     "MatchRequest",
     "Mosaic",
+    "QueueState",
     "SubmapRecord",
     "SubmapState",
     "Window",

@@ -319,7 +319,7 @@ class Mosaic:
 def fuse_maps(
     lattice: GridSpec, maps: Iterable[tuple[OccupancyMap, SE2]], log_odds_max: float
 ) -> OccupancyMap | None:
-    """One map of several placed ones (each with its ``T_frame_map``); None where nothing was seen."""
+    """One map of several placed ones (each with its ``T_frame_map``); None if nothing was seen."""
     mosaic = Mosaic(lattice, log_odds_max)
     for index, (occupancy, T_frame_map) in enumerate(maps):
         mosaic.put(index, None, render_patch(lattice, occupancy, T_frame_map))

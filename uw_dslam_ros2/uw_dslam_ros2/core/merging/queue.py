@@ -16,6 +16,7 @@ from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
 from uw_dslam_ros2.core.merging.graph import residual
 from uw_dslam_ros2.core.merging.plan import Plan, make_plan
+from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,
@@ -46,6 +47,7 @@ class MapQueue:
         self._submaps: dict[SubmapId, StoredSubmap] = {}
         self._withdrawn: set[SubmapId] = set()
         self._anchor: SubmapId | None = None
+        self._vehicles: list[str] = []
         self._answers: dict[MatchKey, Answer] = {}
         self._in_flight: dict[int, Match] = {}
         self._next_request_id = 1
@@ -74,6 +76,8 @@ class MapQueue:
                 )
             return
         self._submaps[submap.submap_id] = stored
+        if submap.vehicle_id not in self._vehicles:
+            self._vehicles.append(submap.vehicle_id)
         wanted = self._config.anchor_vehicle
         if self._anchor is None and wanted in ("", submap.vehicle_id):
             self._anchor = submap.submap_id
@@ -216,6 +220,32 @@ class MapQueue:
                 poses = _moved(merged[submap_id], submap.trajectory)
                 parts.setdefault(submap_id[0], []).append((submap.trajectory_stamp_ns, poses))
         return {vehicle: _by_time(pieces) for vehicle, pieces in parts.items()}
+
+    def to_state(self) -> QueueState:
+        """Everything that has to be kept to go on later; see `from_state`."""
+        return QueueState(
+            tuple(self._submaps[i].submap for i in sorted(self._submaps)),
+            frozenset(self._withdrawn),
+            tuple(self._answers[key] for key in sorted(self._answers)),
+            self._anchor,
+            self._lattice,
+            tuple(self._vehicles),
+            self._next_request_id,
+        )
+
+    @classmethod
+    def from_state(cls, state: QueueState, config: MapQueueConfig | None = None) -> MapQueue:
+        """Go on from a state: same map, same questions; what was in flight is asked again."""
+        queue = cls(config)
+        for submap in state.submaps:
+            stored = StoredSubmap.of(submap, queue._config.max_submap_cells)
+            queue._submaps[submap.submap_id] = stored
+        queue._withdrawn = set(state.withdrawn)
+        queue._answers = {answer.match.key: answer for answer in state.answers}
+        queue._anchor, queue._lattice = state.anchor, state.lattice
+        queue._vehicles = list(state.vehicles)
+        queue._next_request_id = state.next_request_id
+        return queue
 
     def _merged(self) -> dict[SubmapId, SE2]:
         return self._plan().components[0] if self._anchor is not None else {}

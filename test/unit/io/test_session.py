@@ -1,0 +1,209 @@
+"""Sessions survive: a round trip changes nothing, and no interruption loses anything."""
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from unit.merging.fleet import Oracle, map_bytes, run, three_vehicles
+
+from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.merging import MapQueue, SubmapState
+from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, load_session, save_session
+from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
+
+FLEET = three_vehicles()
+
+
+def filled() -> MapQueue:
+    queue = MapQueue()
+    for submap_id in sorted(FLEET.submaps):
+        queue.add_submap(FLEET.submaps[submap_id])
+    return queue
+
+
+def summary(queue: MapQueue):
+    return (
+        map_bytes(queue),
+        [(r.submap.submap_id, r.submap.revision, r.state, r.component) for r in queue.submaps()],
+        queue.num_registrations,
+        [
+            (r.source_ids, r.target_ids)
+            for r in MapQueue.from_state(queue.to_state()).next_requests(99)
+        ],
+    )
+
+
+def test_a_saved_queue_comes_back_as_it_was(tmp_path):
+    queue = filled()
+    oracle = Oracle(FLEET)
+    for request in queue.next_requests(2):
+        queue.add_result(request.request_id, oracle(request))
+    queue.withdraw(("auv_3", 2))
+    save_session(tmp_path / "new" / "session", queue)
+    again = load_session(tmp_path / "new" / "session")
+    assert summary(again) == summary(queue)
+    for submap_id in FLEET.submaps:
+        again.add_submap(FLEET.submaps[submap_id])
+    assert summary(again) == summary(queue)
+    run(queue, oracle)
+    run(again, oracle)
+    assert summary(again) == summary(queue)
+    states = {r.submap.submap_id: r.state for r in again.submaps()}
+    assert states["auv_3", 2] is SubmapState.WITHDRAWN
+
+
+def test_saving_again_writes_only_what_is_new(tmp_path):
+    queue = filled()
+    save_session(tmp_path, queue)
+    statements = []
+    real = sqlite3.connect
+
+    def traced(*args, **kwargs):
+        connection = real(*args, **kwargs)
+        connection.set_trace_callback(statements.append)
+        return connection
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sqlite3, "connect", traced)
+        request = queue.next_requests(1)[0]
+        queue.add_result(request.request_id, Oracle(FLEET)(request))
+        save_session(tmp_path, queue)
+    inserted = [s for s in statements if "INSERT" in s]
+    assert sum("INTO submaps" in s for s in inserted) == 0
+    assert sum("INTO answers" in s for s in inserted) == 1
+
+
+def contents(queue: MapQueue):
+    state = queue.to_state()
+    submaps = [(submap.submap_id, submap.grid.values.tobytes()) for submap in state.submaps]
+    return submaps, state.withdrawn, [answer.match.key for answer in state.answers]
+
+
+class InterruptedWriteError(Exception):
+    pass
+
+
+def test_a_failure_at_any_step_leaves_the_old_session_whole(tmp_path, monkeypatch):
+    """Fail at each statement in turn: what loads is the old state until the commit is through."""
+    old = filled()
+    save_session(tmp_path, old)
+    new = filled()
+    run(new, Oracle(FLEET))
+    new.withdraw(("auv_1", 1))
+    before, after = contents(old), contents(new)
+    assert before != after
+    real = sqlite3.connect
+    for fail_at in range(1000):
+        calls = iter(range(10_000))
+
+        class Failing(sqlite3.Connection):
+            def execute(self, *args, calls=calls, fail_at=fail_at):
+                if next(calls) == fail_at:
+                    raise InterruptedWriteError
+                return super().execute(*args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(sqlite3, "connect", lambda *a, f=Failing, **k: real(*a, factory=f, **k))
+            try:
+                save_session(tmp_path, new)
+            except InterruptedWriteError:
+                failed = True
+            else:
+                failed = False
+        assert contents(load_session(tmp_path)) == (before if failed else after)
+        if not failed:
+            break
+    assert fail_at > 10
+
+
+_SAVE_FOR_EVER = """
+import sys
+from unit.merging.fleet import Oracle, run, three_vehicles
+from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.io.session import save_session
+fleet = three_vehicles()
+queue = MapQueue()
+oracle = Oracle(fleet)
+for submap_id in sorted(fleet.submaps):
+    queue.add_submap(fleet.submaps[submap_id])
+    save_session(sys.argv[1], queue)
+    print(f"{submap_id[0]} {submap_id[1]}", flush=True)
+while True:
+    queue.withdraw(("auv_1", 1))
+    save_session(sys.argv[1], queue)
+    queue.restore(("auv_1", 1))
+    save_session(sys.argv[1], queue)
+"""
+
+
+@pytest.mark.parametrize("kill_after", [1, 12])
+def test_nothing_accepted_is_lost_by_kill_9(tmp_path, kill_after):
+    paths = [str(Path(__file__).parents[2]), *sys.path]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", _SAVE_FOR_EVER, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    saved = []
+    for line in process.stdout:
+        vehicle, sequence = line.split()
+        saved.append((vehicle, int(sequence)))
+        if len(saved) == kill_after:
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait(10)
+    process.stdout.close()
+    assert len(saved) == kill_after
+    held = {record.submap.submap_id for record in load_session(tmp_path).submaps()}
+    assert held >= set(saved)
+
+
+def test_bad_sessions_are_refused_by_name(tmp_path):
+    with pytest.raises(DataError, match="does not exist"):
+        load_session(tmp_path)
+    (tmp_path / SESSION_FILE).write_bytes(b"no database at all" * 100)
+    with pytest.raises(DataError, match=SESSION_FILE):
+        load_session(tmp_path)
+    with pytest.raises(DataError, match=SESSION_FILE):
+        save_session(tmp_path, filled())
+    (tmp_path / SESSION_FILE).unlink()
+    save_session(tmp_path, filled())
+    connection = sqlite3.connect(tmp_path / SESSION_FILE)
+    connection.execute("PRAGMA user_version = 77")
+    connection.commit()
+    connection.close()
+    with pytest.raises(DataError, match="format 77"):
+        load_session(tmp_path)
+
+
+def test_the_export_is_read_by_the_readers(tmp_path):
+    queue = filled()
+    run(queue, Oracle(FLEET))
+    paths = export_queue(tmp_path, queue)
+    assert all(path.is_file() for path in paths)
+    fused = queue.global_map().to_occupancy()
+    read = read_map(tmp_path / "map.yaml")
+    assert read.spec == fused.spec
+    np.testing.assert_array_equal(read.values == 100, fused.values > 50)
+    assert (tmp_path / "submaps" / "auv_2_0003.yaml").is_file()
+    stamps_ns, poses = read_tum(tmp_path / "trajectories" / "auv_1.tum")
+    expected = queue.trajectories()["auv_1"]
+    np.testing.assert_array_equal(stamps_ns, expected[0])
+    np.testing.assert_allclose(poses, expected[1], atol=1e-8)
+    vertices, edges = read_g2o(tmp_path / "graph.g2o")
+    assert len(vertices) == len(FLEET.submaps)
+    assert len(edges) == sum(c.is_inlier for c in queue.constraints())
+
+
+def test_an_empty_queue_can_be_saved_and_exported(tmp_path):
+    save_session(tmp_path, MapQueue())
+    assert load_session(tmp_path).submaps() == []
+    assert [path.name for path in export_queue(tmp_path, MapQueue())] == ["graph.g2o"]

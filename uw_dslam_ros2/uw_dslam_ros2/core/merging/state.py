@@ -1,0 +1,31 @@
+"""Everything that a map queue has to remember."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uw_dslam_ros2.core.grid import GridSpec
+from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
+from uw_dslam_ros2.core.merging.answers import Answer
+
+__all__ = ["QueueState"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QueueState:
+    """What came in and what was decided by others; the map follows from it.
+
+    Requests in flight are not part of it: after a restart they are asked again.
+    """
+
+    submaps: tuple[Submap, ...]
+    """Newest revision of each, by vehicle and sequence."""
+    withdrawn: frozenset[SubmapId]
+    answers: tuple[Answer, ...]
+    anchor: SubmapId | None
+    """Submap that pins the global frame."""
+    lattice: GridSpec | None
+    """Its cells, as the lattice of the global map."""
+    vehicles: tuple[str, ...]
+    """In order of first arrival."""
+    next_request_id: int
