@@ -1,0 +1,97 @@
+"""Simulate a mission: a place, vehicles that survey it, and a bag of recordings for each."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from uw_dslam_ros2.core.errors import UwDslamError
+from uw_dslam_ros2.sim.mission import MissionConfig
+from uw_dslam_ros2.sim.places import PLACES
+from uw_dslam_ros2.sim.recording import simulate_mission
+
+__all__ = ["main"]
+
+
+def _parser() -> argparse.ArgumentParser:
+    default = MissionConfig()
+    parser = argparse.ArgumentParser(prog="simulate", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder to write the mission to")
+    parser.add_argument("--seed", type=int, default=default.seed, help="another place for each")
+    parser.add_argument("--place", choices=PLACES, default=default.place)
+    parser.add_argument("--vehicles", type=int, default=default.num_vehicles, metavar="N")
+    parser.add_argument(
+        "--duration", type=float, default=default.duration_s, metavar="S", help="of each bag [s]"
+    )
+    parser.add_argument(
+        "--overlap",
+        type=float,
+        default=default.overlap,
+        help="part of an area's width that the next vehicle surveys too",
+    )
+    parser.add_argument("--ping-rate", type=float, default=default.ping_rate_hz, metavar="HZ")
+    parser.add_argument("--beams", type=int, default=default.sonar.num_beams)
+    parser.add_argument("--ranges", type=int, default=default.sonar.num_ranges, help="range bins")
+    parser.add_argument("--max-range", type=float, default=default.sonar.max_range_m, metavar="M")
+    parser.add_argument("--speed", type=float, default=default.navigation.speed_m_s, metavar="M/S")
+    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
+    parser.add_argument(
+        "--processes", type=int, default=os.cpu_count() or 1, help="the result is the same"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    return parser
+
+
+def _config(arguments: argparse.Namespace) -> MissionConfig:
+    default = MissionConfig()
+    return MissionConfig(
+        seed=arguments.seed,
+        place=arguments.place,
+        num_vehicles=arguments.vehicles,
+        duration_s=arguments.duration,
+        overlap=arguments.overlap,
+        ping_rate_hz=arguments.ping_rate,
+        sonar=replace(
+            default.sonar,
+            num_beams=arguments.beams,
+            num_ranges=arguments.ranges,
+            max_range_m=arguments.max_range,
+        ),
+        navigation=replace(default.navigation, speed_m_s=arguments.speed),
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; the exit code is 2 for bad input."""
+    arguments = _parser().parse_args(argv)
+    try:
+        config = _config(arguments)
+        with tqdm(unit="ping", desc="simulate", disable=arguments.quiet) as bar:
+
+            def progress(done: int, total: int) -> None:
+                bar.total = total
+                bar.update(done - bar.n)
+
+            mission = simulate_mission(
+                arguments.out,
+                config,
+                storage=arguments.storage,
+                num_processes=arguments.processes,
+                progress=progress,
+            )
+    except UwDslamError as error:
+        print(f"simulate: error: {error}", file=sys.stderr)
+        return 2
+    size_mb = sum(f.stat().st_size for bag in mission.bags for f in bag.iterdir()) / 1e6
+    print(f"{len(mission.bags)} bags, {size_mb:.0f} MB: {', '.join(map(str, mission.bags))}")
+    print(f"truth: {mission.truth_map.parent}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

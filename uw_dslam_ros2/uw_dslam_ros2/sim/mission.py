@@ -1,0 +1,160 @@
+"""Missions: several vehicles survey overlapping parts of one place, each on its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar.types import SonarImage
+from uw_dslam_ros2.sim.paths import SurveyArea, plan_survey, split_areas
+from uw_dslam_ros2.sim.places import PLACES, make_place
+from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
+from uw_dslam_ros2.sim.vehicle import Motion, NavigationConfig, NavigationLog, drive, measure
+from uw_dslam_ros2.sim.world import World
+
+__all__ = [
+    "T_BASE_DVL",
+    "T_BASE_SONAR",
+    "Mission",
+    "MissionConfig",
+    "PingMaker",
+    "VehicleRun",
+    "every_metre",
+    "plan_mission",
+    "tiny_mission_config",
+]
+
+IntArray = NDArray[np.int64]
+
+_NS = 1_000_000_000
+# Any time would do; a round one in the past shows that nobody reads the wall clock.
+_START_NS = 1_700_000_000 * _NS
+
+T_BASE_SONAR = SE2(0.30, 0.0, 0.0)
+"""Where the sonar sits on every vehicle, looking ahead."""
+T_BASE_DVL = SE2(-0.10, 0.05, 0.0)
+"""Where the DVL sits."""
+
+
+@dataclass(frozen=True, slots=True)
+class MissionConfig(Config):
+    """What to simulate."""
+
+    seed: int = setting(0, 0, 2**31 - 1, "a different place and mission for every seed")
+    place: str = setting("harbour", choices=PLACES, doc="kind of place")
+    num_vehicles: int = setting(3, 1, 20, "vehicles")
+    duration_s: float = setting(200.0, 2.0, 7200.0, "length of each recording [s]")
+    overlap: float = setting(
+        0.35, 0.0, 0.95, "part of an area's width that the next vehicle surveys too"
+    )
+    clearance_m: float = setting(4.0, 1.0, 20.0, "distance kept from walls [m]")
+    ping_rate_hz: float = setting(3.0, 0.2, 30.0, "sonar pings per second")
+    truth_resolution_m: float = setting(0.05, 0.01, 2.0, "cell size of the true map [m]")
+    sonar: SonarConfig = setting(SonarConfig())
+    navigation: NavigationConfig = setting(NavigationConfig())
+
+
+def tiny_mission_config(seed: int = 0) -> MissionConfig:
+    """Two vehicles that see nearly the same place, in a second or two: for tests."""
+    return MissionConfig(
+        seed=seed,
+        num_vehicles=2,
+        duration_s=40.0,
+        overlap=0.9,
+        ping_rate_hz=2.0,
+        truth_resolution_m=0.1,
+        sonar=SonarConfig(num_beams=128, num_ranges=200),
+        navigation=NavigationConfig(speed_m_s=1.5),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VehicleRun:
+    """One vehicle's part of a mission; ``ping_motion`` is the motion at the times of the pings."""
+
+    vehicle_id: str
+    area: SurveyArea
+    motion: Motion
+    navigation: NavigationLog
+    ping_motion: Motion
+
+    def sonar_poses(self) -> NDArray[np.float64]:
+        """True poses (K, 3) [x, y, yaw] of the sonar in the world at its pings."""
+        poses = [self.ping_motion.pose(i) @ T_BASE_SONAR for i in range(self.num_pings)]
+        return np.array([pose.as_array() for pose in poses])
+
+    @property
+    def num_pings(self) -> int:
+        """How many pings the vehicle makes."""
+        return len(self.ping_motion.stamp_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mission:
+    """Everything about a mission but its images, which `PingMaker` makes one by one."""
+
+    config: MissionConfig
+    world: World
+    runs: tuple[VehicleRun, ...]
+
+
+def plan_mission(config: MissionConfig) -> Mission:
+    """Build the place, send the vehicles through it, and sample their instruments."""
+    world = make_place(config.place, config.seed, config.num_vehicles)
+    areas = split_areas(world, config.num_vehicles, config.overlap)
+    runs = [_run(config, world, area, index) for index, area in enumerate(areas)]
+    return Mission(config, world, tuple(runs))
+
+
+def _run(config: MissionConfig, world: World, area: SurveyArea, index: int) -> VehicleRun:
+    rng = np.random.default_rng([config.seed, 10, index])
+    # Bends cost time: a route for the cruising speed is always long enough.
+    length_m = 1.2 * config.navigation.speed_m_s * config.duration_s + 20.0
+    route = plan_survey(world, area, length_m, config.clearance_m, rng)
+    # Vehicles do not start at the same moment.
+    start_ns = _START_NS + index * 370_000_000
+    motion = drive(route, start_ns, config.duration_s, config.navigation, rng)
+    log = measure(motion, config.navigation, T_BASE_DVL, rng)
+    first = start_ns + int(rng.integers(50_000_000, 150_000_000))
+    pings = np.arange(first, motion.stamp_ns[-1], round(_NS / config.ping_rate_hz))
+    return VehicleRun(f"auv_{index + 1}", area, motion, log, motion.at(pings))
+
+
+class PingMaker:
+    """Makes the images of a mission in any order: each ping has a seed of its own."""
+
+    def __init__(self, mission: Mission) -> None:
+        self._mission = mission
+        self._sonar = SonarSimulator(mission.world, mission.config.sonar)
+
+    def ping(self, vehicle: int, index: int) -> SonarImage:
+        """Return the image of one ping."""
+        motion = self._mission.runs[vehicle].ping_motion
+        rng = np.random.default_rng([self._mission.config.seed, 20, vehicle, index])
+        return self._sonar.ping(
+            int(motion.stamp_ns[index]),
+            motion.pose(index) @ T_BASE_SONAR,
+            float(motion.depth_m[index]),
+            rng,
+        )
+
+    def pings(self, vehicle: int, indices: range) -> Iterator[SonarImage]:
+        """Images of several pings of one vehicle."""
+        for index in indices:
+            yield self.ping(vehicle, index)
+
+
+def every_metre(run: VehicleRun) -> NDArray[np.float64]:
+    """Sonar poses (K, 3) of a run, thinned to one for about each metre or ten degrees."""
+    poses = run.sonar_poses()
+    moved = np.hypot(*np.diff(poses[:, :2], axis=0).T) + np.abs(
+        np.diff(poses[:, 2])
+    ) / math.radians(10.0)
+    keys = np.floor(np.concatenate([[0.0], np.cumsum(moved)]))
+    return poses[np.unique(keys, return_index=True)[1]]

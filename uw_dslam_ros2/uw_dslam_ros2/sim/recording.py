@@ -1,0 +1,350 @@
+"""Missions as files: a bag for each vehicle, and the truth in a folder of its own."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.grid import OCCUPIED, OccupancyMap
+from uw_dslam_ros2.core.sonar.types import SonarImage
+from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.outgoing import MessageFactory
+from uw_dslam_ros2.io.recordings import BagWriter
+from uw_dslam_ros2.io.trajectories import write_tum
+from uw_dslam_ros2.sim.mission import (
+    T_BASE_DVL,
+    T_BASE_SONAR,
+    Mission,
+    MissionConfig,
+    PingMaker,
+    VehicleRun,
+    every_metre,
+    plan_mission,
+)
+from uw_dslam_ros2.sim.raster import grid_over, seen_map
+
+__all__ = ["RecordedMission", "read_mission", "simulate_mission"]
+
+_CHUNK_PINGS = 40
+_FREQUENCY_HZ = 1.2e6
+_SOUND_SPEED_M_S = 1500.0
+_TRUTH_RATE_STEP = 5  # every fifth of 50 samples per second
+
+# Quaternions [x, y, z, w] of frames in base_link: the sonar's z forward, x up, y to starboard;
+# the DVL's x forward, z down.
+_SONAR_ROTATION = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+_DVL_ROTATION = (1.0, 0.0, 0.0, 0.0)
+_NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+Progress = Callable[[int, int], None]
+"""Called with pings done and pings in all."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedMission:
+    """Where the files of a mission are."""
+
+    folder: Path
+    vehicle_ids: tuple[str, ...]
+    bags: tuple[Path, ...]
+    truth_map: Path
+    truth_trajectories: tuple[Path, ...]
+    summary: dict[str, Any]
+
+
+def simulate_mission(
+    folder: str | Path,
+    config: MissionConfig = MissionConfig(),
+    *,
+    storage: str = "mcap",
+    num_processes: int = 1,
+    progress: Progress | None = None,
+) -> RecordedMission:
+    """Simulate a mission and write it; the same configuration gives the same bytes.
+
+    Writes ``<vehicle>/`` (a rosbag2 folder each), ``truth/map.yaml`` (what could be seen),
+    ``truth/<vehicle>.tum``, ``truth/outline.json`` and ``mission.json``.
+
+    Parameters
+    ----------
+    folder : must not hold a mission yet; made if it is missing.
+    num_processes : how many processes make the images; the result does not depend on it.
+
+    Raises
+    ------
+    DataError
+        If the folder holds a mission already or cannot be written.
+    """
+    folder = Path(folder)
+    if (folder / "mission.json").exists():
+        raise DataError(f"{folder} holds a mission already; give another folder or remove it")
+    mission = plan_mission(config)
+    total = sum(run.num_pings for run in mission.runs)
+    done = 0
+    with _ping_source(mission, num_processes) as images:
+        for vehicle, run in enumerate(mission.runs):
+            with BagWriter(folder / run.vehicle_id, storage) as writer:
+                recorder = _Recorder(writer, run, config)
+                for image in images(vehicle, run.num_pings):
+                    recorder.write_until(image.stamp_ns)
+                    recorder.write_image(image)
+                    done += 1
+                    if progress is not None:
+                        progress(done, total)
+                recorder.write_until(None)
+    _write_truth(folder / "truth", mission)
+    return read_mission(folder)
+
+
+ImageSource = Callable[[int, int], Iterator[SonarImage]]
+
+
+class _ping_source:  # noqa: N801 - used like a function
+    """Context that gives ``images(vehicle, count)``: vehicle by vehicle, in order."""
+
+    def __init__(self, mission: Mission, num_processes: int) -> None:
+        self._mission = mission
+        self._num_processes = num_processes
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> ImageSource:
+        if self._num_processes <= 1:
+            maker = PingMaker(self._mission)
+            return lambda vehicle, count: maker.pings(vehicle, range(count))
+        self._pool = ProcessPoolExecutor(
+            self._num_processes,
+            # A fresh interpreter: forking a process with threads (numba, pytest) is not safe.
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_start_worker,
+            initargs=(self._mission.config,),
+        )
+        chunks = {
+            vehicle: [
+                self._pool.submit(_make_chunk, vehicle, start, min(start + _CHUNK_PINGS, count))
+                for start in range(0, count, _CHUNK_PINGS)
+            ]
+            for vehicle, count in enumerate(run.num_pings for run in self._mission.runs)
+        }
+
+        def images(vehicle: int, _count: int) -> Iterator[SonarImage]:
+            futures = chunks.pop(vehicle)
+            while futures:
+                yield from futures.pop(0).result()
+
+        return images
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+
+_worker: list[PingMaker] = []
+
+
+def _start_worker(config: MissionConfig) -> None:
+    # The place is cheaper to plan again than to send.
+    _worker.append(PingMaker(plan_mission(config)))
+
+
+def _make_chunk(vehicle: int, start: int, stop: int) -> list[SonarImage]:
+    return list(_worker[0].pings(vehicle, range(start, stop)))
+
+
+class _Recorder:
+    """Writes one vehicle's bag in order of time."""
+
+    def __init__(self, writer: BagWriter, run: VehicleRun, config: MissionConfig) -> None:
+        self._writer = writer
+        self._make = MessageFactory(writer.typestore)
+        self._run = run
+        self._config = config
+        self._altitude_m = 5.0
+        who = run.vehicle_id
+        self._base, self._sonar = f"{who}/base_link", f"{who}/sonar"
+        writer.add_topic("/tf_static", "tf2_msgs/msg/TFMessage", is_latched=True)
+        writer.add_topic(f"/{who}/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+        writer.add_topic(f"/{who}/imu", "sensor_msgs/msg/Imu")
+        writer.add_topic(f"/{who}/dvl", "marine_acoustic_msgs/msg/Dvl")
+        writer.add_topic(f"/{who}/depth", "sensor_msgs/msg/FluidPressure")
+        writer.add_topic(f"/{who}/truth/odom", "nav_msgs/msg/Odometry")
+        start_ns = int(run.motion.stamp_ns[0])
+        self._writer.write("/tf_static", start_ns, self._mounts(start_ns))
+        log = run.navigation
+        events = itertools.chain(
+            ((int(t), 0, i) for i, t in enumerate(log.imu_stamp_ns)),
+            ((int(t), 1, i) for i, t in enumerate(log.dvl_stamp_ns)),
+            ((int(t), 2, i) for i, t in enumerate(log.depth_stamp_ns)),
+            (
+                (int(run.motion.stamp_ns[i]), 3, i)
+                for i in range(0, len(run.motion.stamp_ns), _TRUTH_RATE_STEP)
+            ),
+        )
+        self._pending = sorted(events, reverse=True)
+        self._writers = (self._write_imu, self._write_dvl, self._write_depth, self._write_truth)
+
+    def _mounts(self, stamp_ns: int) -> Any:
+        who = self._run.vehicle_id
+        mounts = [
+            (f"{who}/sonar", (T_BASE_SONAR.x, T_BASE_SONAR.y, -0.10), _SONAR_ROTATION),
+            (f"{who}/dvl", (T_BASE_DVL.x, T_BASE_DVL.y, -0.15), _DVL_ROTATION),
+            (f"{who}/imu", (0.0, 0.0, 0.0), _NO_ROTATION),
+            (f"{who}/depth", (0.0, 0.0, 0.0), _NO_ROTATION),
+        ]
+        return self._make.transforms(stamp_ns, self._base, mounts)
+
+    def write_until(self, stamp_ns: int | None) -> None:
+        """Write everything but images up to a time; None means all that is left."""
+        while self._pending and (stamp_ns is None or self._pending[-1][0] <= stamp_ns):
+            stamp, kind, index = self._pending.pop()
+            self._writers[kind](stamp, index)
+
+    def write_image(self, image: SonarImage) -> None:
+        """Write one ping."""
+        message = self._make.sonar_image(
+            self._sonar,
+            image,
+            beam_width_rad=self._config.sonar.beam_width_rad,
+            frequency_hz=_FREQUENCY_HZ,
+            sound_speed_m_s=_SOUND_SPEED_M_S,
+        )
+        self._writer.write(f"/{self._run.vehicle_id}/sonar", image.stamp_ns, message)
+
+    def _write_imu(self, stamp_ns: int, index: int) -> None:
+        log, navigation = self._run.navigation, self._config.navigation
+        message = self._make.imu(
+            stamp_ns,
+            f"{self._run.vehicle_id}/imu",
+            float(log.yaw_rad[index]),
+            navigation.yaw_noise_rad**2,
+            float(log.yaw_rate_rad_s[index]),
+            navigation.gyro_noise_rad_s**2,
+        )
+        self._writer.write(f"/{self._run.vehicle_id}/imu", stamp_ns, message)
+
+    def _write_dvl(self, stamp_ns: int, index: int) -> None:
+        velocity = self._run.navigation.dvl_velocity_m_s[index]
+        message = self._make.dvl(
+            stamp_ns,
+            f"{self._run.vehicle_id}/dvl",
+            velocity if np.isfinite(velocity).all() else None,
+            self._config.navigation.dvl_noise_m_s**2,
+            self._altitude_m,
+        )
+        self._writer.write(f"/{self._run.vehicle_id}/dvl", stamp_ns, message)
+
+    def _write_depth(self, stamp_ns: int, index: int) -> None:
+        message = self._make.pressure(
+            stamp_ns,
+            f"{self._run.vehicle_id}/depth",
+            float(self._run.navigation.depth_m[index]),
+            self._config.navigation.depth_noise_m,
+        )
+        self._writer.write(f"/{self._run.vehicle_id}/depth", stamp_ns, message)
+
+    def _write_truth(self, stamp_ns: int, index: int) -> None:
+        motion = self._run.motion
+        message = self._make.odometry(
+            stamp_ns,
+            "map",
+            self._base,
+            motion.pose(index),
+            float(motion.depth_m[index]),
+            motion.velocity_m_s[index],
+            float(motion.yaw_rate_rad_s[index]),
+        )
+        self._writer.write(f"/{self._run.vehicle_id}/truth/odom", stamp_ns, message)
+
+
+def _write_truth(folder: Path, mission: Mission) -> None:
+    """Everything that a recording of the real world would not have, and `mission.json`."""
+    config, world = mission.config, mission.world
+    spec = grid_over(world, config.truth_resolution_m)
+    seen = [
+        seen_map(world, spec, every_metre(run), config.sonar.fov_rad, config.sonar.max_range_m)
+        for run in mission.runs
+    ]
+    values = np.max([m.values for m in seen], axis=0)
+    write_map(folder / "map", OccupancyMap(spec, values))
+    for run in mission.runs:
+        motion = run.motion
+        write_tum(
+            folder / f"{run.vehicle_id}.tum",
+            motion.stamp_ns[::_TRUTH_RATE_STEP],
+            np.array(
+                [motion.pose(i).as_array() for i in range(0, len(motion.poses), _TRUTH_RATE_STEP)]
+            ),
+        )
+    outline = {
+        "frame": "map",
+        "segments_m": np.round(world.segments, 4).tolist(),
+        "surface": [world.surfaces[i].name for i in world.surface_of],
+    }
+    (folder / "outline.json").write_text(json.dumps(outline) + "\n")
+    summary = {
+        "config": config.to_dict(),
+        "vehicles": [_vehicle_summary(run) for run in mission.runs],
+        "overlap_of_seen_walls": _overlaps(seen),
+        "T_base_sonar": T_BASE_SONAR.as_array().tolist(),
+        "truth_map": "truth/map.yaml",
+    }
+    (folder.parent / "mission.json").write_text(json.dumps(summary, indent=1) + "\n")
+
+
+def _vehicle_summary(run: VehicleRun) -> dict[str, Any]:
+    steps = np.hypot(*np.diff(run.motion.poses[:, :2], axis=0).T)
+    start = run.motion.pose(0)
+    return {
+        "vehicle_id": run.vehicle_id,
+        "bag": run.vehicle_id,
+        "truth_trajectory": f"truth/{run.vehicle_id}.tum",
+        "T_map_start": [start.x, start.y, start.yaw],
+        "start_ns": int(run.motion.stamp_ns[0]),
+        "stop_ns": int(run.motion.stamp_ns[-1]),
+        "path_length_m": round(float(steps.sum()), 2),
+        "num_pings": run.num_pings,
+    }
+
+
+def _overlaps(seen: list[OccupancyMap]) -> list[list[float]]:
+    """Entry [i][j]: the part of the walls seen by vehicle i that vehicle j saw too."""
+    walls = [m.values == OCCUPIED for m in seen]
+    return [[round(float((a & b).sum() / max(1, a.sum())), 3) for b in walls] for a in walls]
+
+
+def read_mission(folder: str | Path) -> RecordedMission:
+    """Find the files of a mission that was simulated before.
+
+    Raises
+    ------
+    DataError
+        If there is no readable ``mission.json``, or a file that it names is missing.
+    """
+    folder = Path(folder)
+    path = folder / "mission.json"
+    try:
+        summary = json.loads(path.read_text())
+        vehicles = summary["vehicles"]
+        recorded = RecordedMission(
+            folder=folder,
+            vehicle_ids=tuple(v["vehicle_id"] for v in vehicles),
+            bags=tuple(folder / v["bag"] for v in vehicles),
+            truth_map=folder / summary["truth_map"],
+            truth_trajectories=tuple(folder / v["truth_trajectory"] for v in vehicles),
+            summary=summary,
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is not a mission's description: {error}") from error
+    for file in (*recorded.bags, recorded.truth_map, *recorded.truth_trajectories):
+        if not file.exists():
+            raise DataError(f"{path} names {file}, which does not exist")
+    return recorded
