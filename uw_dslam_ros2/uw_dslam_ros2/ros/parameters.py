@@ -1,0 +1,153 @@
+"""Settings as ROS parameters: every field of a `Config` is declared, with its text and range."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from uw_dslam_ros2.core.config import Config
+from uw_dslam_ros2.core.errors import ConfigError
+from uw_dslam_ros2.io.settings import SECTIONS
+
+__all__ = ["declare_config", "refuse_unknown_parameters", "settings_of"]
+
+_OWN_TO_RCLPY = ("use_sim_time", "start_type_description_service")
+_TYPES = {
+    bool: Parameter.Type.BOOL,
+    int: Parameter.Type.INTEGER,
+    float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING,
+}
+_ARRAY_TYPES = {
+    bool: Parameter.Type.BOOL_ARRAY,
+    int: Parameter.Type.INTEGER_ARRAY,
+    float: Parameter.Type.DOUBLE_ARRAY,
+    str: Parameter.Type.STRING_ARRAY,
+}
+
+
+def declare_config[ConfigT: Config](
+    node: Node, config_type: type[ConfigT], prefix: str = ""
+) -> ConfigT:
+    """Declare a parameter per field (dotted names for nested ones); build the settings of them.
+
+    Raises
+    ------
+    ConfigError
+        If a value given to the node has the wrong type or lies outside its range; the text names
+        the parameter.
+    """
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(config_type):
+        name = f"{prefix}.{field.name}" if prefix else field.name
+        if isinstance(field.default, Config):
+            values[field.name] = declare_config(node, type(field.default), name)
+        else:
+            values[field.name] = _declare(node, name, field, parameter_type(config_type, field))
+    return config_type(**values)  # __post_init__ checks again, choices included
+
+
+def parameter_type(config_type: type[Config], field: dataclasses.Field[Any]) -> Parameter.Type:
+    """Type of the ROS parameter that stands for a field."""
+    if isinstance(field.default, tuple):
+        hint = typing.get_type_hints(config_type)[field.name]
+        return _ARRAY_TYPES[typing.get_args(hint)[0]]
+    return _TYPES[type(field.default)]
+
+
+def _declare(node: Node, name: str, field: dataclasses.Field[Any], kind: Parameter.Type) -> Any:
+    low: Any = field.metadata.get("low")
+    high: Any = field.metadata.get("high")
+    choices = field.metadata.get("choices")
+    descriptor = ParameterDescriptor(
+        description=field.metadata.get("doc", ""),
+        read_only=True,
+        additional_constraints=f"one of {', '.join(choices)}" if choices else "",
+    )
+    if kind == Parameter.Type.INTEGER and None not in (low, high):
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    elif kind == Parameter.Type.DOUBLE and None not in (low, high):
+        bounds = FloatingPointRange(from_value=float(low), to_value=float(high))
+        descriptor.floating_point_range = [bounds]
+    default = list(field.default) if isinstance(field.default, tuple) else field.default
+    # rclpy cannot tell the type of an empty list, so such a parameter is declared by type and
+    # stays unset.
+    is_empty_array = default == []
+    try:
+        parameter = node.declare_parameter(name, kind if is_empty_array else default, descriptor)
+    except InvalidParameterTypeException as error:
+        given = _given(node)[name].value
+        hint = f"; write {given}.0" if kind == Parameter.Type.DOUBLE and type(given) is int else ""
+        raise ConfigError(
+            f"parameter {name} is {given!r} ({type(given).__name__}), "
+            f"expected {kind.name.lower()}{hint}"
+        ) from error
+    except InvalidParameterValueException as error:
+        raise ConfigError(
+            f"parameter {name} is {_given(node)[name].value!r}, expected {low} to {high}: "
+            f"{field.metadata.get('doc', '')}"
+        ) from error
+    value = () if parameter.type_ == Parameter.Type.NOT_SET else parameter.value
+    if choices and value not in choices:
+        raise ConfigError(f"parameter {name} is {value!r}, expected one of {', '.join(choices)}")
+    return tuple(value) if isinstance(field.default, tuple) else value
+
+
+def refuse_unknown_parameters(node: Node) -> None:
+    """Raise `ConfigError` if the node was given a parameter that it does not have.
+
+    One file may hold the groups of all nodes under ``/**``: a node skips the others' groups.
+    """
+    own = {name.split(".")[0] for name in _declared(node)}
+    for name in sorted(_given(node)):
+        head = name.split(".")[0]
+        is_anothers = head in SECTIONS and head not in own
+        if (
+            node.has_parameter(name)
+            or name in _OWN_TO_RCLPY
+            or head == "qos_overrides"
+            or is_anothers
+        ):
+            continue
+        raise ConfigError(
+            f"parameter {name} is unknown to {node.get_name()}; {_nearest(name, _declared(node))}"
+        )
+
+
+def _given(node: Node) -> dict[str, Parameter]:
+    # rclpy has no public name for what a node was started with.
+    return node._parameter_overrides
+
+
+def _declared(node: Node) -> list[str]:
+    return sorted(node.get_parameters_by_prefix(""))
+
+
+def _nearest(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=3)
+    if close:
+        return f"did you mean {' or '.join(close)}?"
+    return f"it has {', '.join(known)}"
+
+
+def settings_of(
+    config_type: type[Config], prefix: str = ""
+) -> Iterator[tuple[str, type[Config], dataclasses.Field[Any]]]:
+    """Every plain field, nested ones included, with its parameter name; for documentation."""
+    for field in dataclasses.fields(config_type):
+        name = f"{prefix}.{field.name}" if prefix else field.name
+        if isinstance(field.default, Config):
+            yield from settings_of(type(field.default), name)
+        else:
+            yield name, config_type, field

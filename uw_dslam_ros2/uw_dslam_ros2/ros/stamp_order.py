@@ -1,0 +1,77 @@
+"""Messages of several sensors in the order of their stamps, whatever order they arrive in."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Iterator
+
+__all__ = ["StampOrder"]
+
+
+class StampOrder[ItemT]:
+    """Holds items back until nothing earlier is to be expected.
+
+    Sensors have queues of their own, and an executor empties them in any order. What a mapper
+    makes of its input must not depend on that. An item leaves when one has arrived that is
+    `hold_ns` younger; one that is later still than that leaves at once and is counted as late.
+
+    Parameters
+    ----------
+    hold_ns : how much later than a younger one an item may arrive.
+    jump_ns : a stream whose stamps go back by more than this has begun again.
+    """
+
+    def __init__(self, hold_ns: int, jump_ns: int) -> None:
+        self._hold_ns = hold_ns
+        self._jump_ns = jump_ns
+        self._ties = itertools.count()
+        self.num_late = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._heap: list[tuple[int, int, ItemT]] = []
+        self._newest_of_stream: dict[str, int] = {}
+        self._newest_ns: int | None = None
+        self._released_ns: int | None = None
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the youngest item seen."""
+        return self._newest_ns
+
+    def __len__(self) -> int:
+        return len(self._heap)
+
+    def has_jumped_back(self, stream: str, stamp_ns: int) -> bool:
+        """Whether this stamp shows that a recording began again."""
+        newest_ns = self._newest_of_stream.get(stream)
+        return newest_ns is not None and stamp_ns < newest_ns - self._jump_ns
+
+    def add(self, stream: str, stamp_ns: int, item: ItemT) -> None:
+        """Take an item."""
+        newest_ns = self._newest_of_stream.get(stream, stamp_ns)
+        self._newest_of_stream[stream] = max(newest_ns, stamp_ns)
+        self._newest_ns = max(self._newest_ns or stamp_ns, stamp_ns)
+        if self._released_ns is not None and stamp_ns < self._released_ns:
+            self.num_late += 1
+        heapq.heappush(self._heap, (stamp_ns, next(self._ties), item))
+
+    def peek(self) -> ItemT | None:
+        """The item that may leave next, or None while an earlier one may come."""
+        if not self._heap or self._newest_ns is None:
+            return None
+        stamp_ns, _, item = self._heap[0]
+        return item if stamp_ns <= self._newest_ns - self._hold_ns else None
+
+    def rest(self) -> Iterator[ItemT]:
+        """All that is left, in the order of the stamps."""
+        while self._heap:
+            yield self.pop()
+
+    def pop(self) -> ItemT:
+        """Take out the earliest item."""
+        stamp_ns, _, item = heapq.heappop(self._heap)
+        self._released_ns = max(self._released_ns or stamp_ns, stamp_ns)
+        return item
