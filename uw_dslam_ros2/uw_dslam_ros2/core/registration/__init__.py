@@ -1,1 +1,20 @@
 """Certified registration of point sets and maps."""
+
+from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, register_grids
+from uw_dslam_ros2.core.registration.result import (
+    PriorWindow,
+    Progress,
+    RegistrationResult,
+    Rival,
+    Verdict,
+)
+
+__all__ = [
+    "GridRegistrationConfig",
+    "PriorWindow",
+    "Progress",
+    "RegistrationResult",
+    "Rival",
+    "Verdict",
+    "register_grids",
+]

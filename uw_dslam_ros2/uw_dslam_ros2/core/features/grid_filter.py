@@ -1,0 +1,161 @@
+"""What the cells of an occupancy map say once specks are gone: walls, free space, unknown."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import OccupancyMap
+
+__all__ = ["CellEvidence", "clean_cells", "coarsen"]
+
+FloatGrid = NDArray[np.float32]
+
+# The paper's maps and map_server agree on decided cells; between the two lies "contradicting
+# echoes".
+_WALL_MIN_PERCENT = 60
+_FREE_MAX_PERCENT = 40
+_LINE_LENGTH_CELLS = 9
+_MIN_LINE_CELLS = 4
+_MAJORITY_WIDTH_CELLS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CellEvidence:
+    """Evidence of a grid's cells, each array (R, C) float32 in [0, 1].
+
+    ``wall`` is that of a wall somewhere in the cell, ``free`` and ``known`` are shares of the
+    cell's area. ``row`` and ``col`` tell where in the cell the wall lies, in cells from the grid's
+    outer corner.
+    """
+
+    resolution_m: float
+    wall: FloatGrid
+    free: FloatGrid
+    known: FloatGrid
+    row: FloatGrid
+    col: FloatGrid
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(num_rows, num_cols)``."""
+        num_rows, num_cols = self.wall.shape
+        return num_rows, num_cols
+
+
+def _line_offsets() -> NDArray[np.int64]:
+    """Cells [row, col] of bars in eight directions (8, K, 2); shorter ones repeat (0, 0)."""
+    half = _LINE_LENGTH_CELLS // 2
+    offsets = np.arange(-half, half + 1)
+    col, row = np.meshgrid(offsets, offsets)
+    bars = []
+    for step in range(8):
+        angle = step * math.pi / 8.0
+        across = np.abs(row * math.cos(angle) - col * math.sin(angle))
+        along = np.abs(row * math.sin(angle) + col * math.cos(angle))
+        inside = (across <= 1.3) & (along <= half + 0.3) & ((row != 0) | (col != 0))
+        bars.append(np.column_stack([row[inside], col[inside]]))
+    longest = max(len(bar) for bar in bars)
+    result = np.zeros((8, longest, 2), np.int64)
+    for index, bar in enumerate(bars):
+        result[index, : len(bar)] = bar
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _keep_lines(
+    wall: NDArray[np.bool_], offsets: NDArray[np.int64], min_cells: int
+) -> NDArray[np.bool_]:
+    """Wall cells through which some bar holds ``min_cells`` walls, themselves included."""
+    num_rows, num_cols = wall.shape
+    kept = np.zeros((num_rows, num_cols), np.bool_)
+    for row in range(num_rows):
+        for col in range(num_cols):
+            if not wall[row, col]:
+                continue
+            for bar in range(offsets.shape[0]):
+                count = 1
+                for k in range(offsets.shape[1]):
+                    d_row, d_col = offsets[bar, k, 0], offsets[bar, k, 1]
+                    r, c = row + d_row, col + d_col
+                    if (d_row != 0 or d_col != 0) and 0 <= r < num_rows and 0 <= c < num_cols:
+                        count += wall[r, c]
+                if count >= min_cells:
+                    kept[row, col] = True
+                    break
+    return kept
+
+
+def _surface(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Walls without the inside of filled bodies, which no echo comes from."""
+    inside = cv2.erode(wall.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2)
+    return wall & (inside == 0)
+
+
+def clean_cells(occupancy: OccupancyMap) -> CellEvidence:
+    """Drop specks from a map (R, C).
+
+    A wall cell stays where a line of nine cells through it holds a line's worth of walls; free and
+    unknown are decided by the majority of a neighbourhood. Algorithm 2's clustering filter, on
+    cells instead of points.
+    """
+    values = occupancy.values
+    wall = values >= _WALL_MIN_PERCENT
+    offsets = _line_offsets()
+    for _ in range(2):  # specks that leaned on specks go in the second round
+        wall = _keep_lines(wall, offsets, _MIN_LINE_CELLS)
+    body, wall = wall, _surface(wall)
+    size = (_MAJORITY_WIDTH_CELLS, _MAJORITY_WIDTH_CELLS)
+    is_free = ((values >= 0) & (values <= _FREE_MAX_PERCENT)).astype(np.float32)
+    free = cv2.boxFilter(is_free, -1, size, borderType=cv2.BORDER_CONSTANT) > 0.5
+    is_known = (values >= 0).astype(np.float32)
+    known = cv2.boxFilter(is_known, -1, size, borderType=cv2.BORDER_REPLICATE) > 0.5
+    free &= ~body
+    evidence = np.clip((values.astype(np.float32) - 50.0) / 40.0, 0.0, 1.0)
+    rows, cols = np.indices(values.shape).astype(np.float32) + np.float32(0.5)
+    return CellEvidence(
+        occupancy.spec.resolution_m,
+        np.where(wall, evidence, np.float32(0.0)),
+        free.astype(np.float32),
+        (known | body).astype(np.float32),
+        rows,
+        cols,
+    )
+
+
+def coarsen(cells: CellEvidence, resolution_m: float) -> CellEvidence:
+    """The same evidence on larger cells whose grid starts at the same corner; any ratio from 1 up.
+
+    The wall's place inside a large cell is the mean of the small wall cells in it, so that no
+    precision is lost.
+    """
+    ratio = resolution_m / cells.resolution_m
+    if ratio < 1.0 + 1e-9:
+        return cells
+    starts = [_block_starts(size, ratio) for size in cells.shape]
+    wall_sum = _block_sum(cells.wall, starts)
+    count = _block_sum(np.ones(cells.shape, np.float32), starts)
+    weight = np.maximum(wall_sum, np.float32(1e-9))
+    return CellEvidence(
+        resolution_m,
+        # A line through a block of k x k cells fills k of them; half of that is a wall.
+        np.minimum(wall_sum * np.float32(2.0) / np.sqrt(count), np.float32(1.0)),
+        _block_sum(cells.free, starts) / count,
+        _block_sum(cells.known, starts) / count,
+        (_block_sum(cells.wall * cells.row, starts) / weight / ratio).astype(np.float32),
+        (_block_sum(cells.wall * cells.col, starts) / weight / ratio).astype(np.float32),
+    )
+
+
+def _block_starts(size: int, ratio: float) -> NDArray[np.int64]:
+    block = np.floor((np.arange(size) + 0.5) / ratio).astype(np.int64)
+    return np.searchsorted(block, np.arange(block[-1] + 1))
+
+
+def _block_sum(values: FloatGrid, starts: list[NDArray[np.int64]]) -> FloatGrid:
+    return np.add.reduceat(np.add.reduceat(values, starts[0], axis=0), starts[1], axis=1)

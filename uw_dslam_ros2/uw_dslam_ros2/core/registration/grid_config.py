@@ -1,0 +1,39 @@
+"""Settings of the registration of grids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uw_dslam_ros2.core.config import Config, setting
+
+__all__ = ["GridRegistrationConfig"]
+
+
+@dataclass(frozen=True, slots=True)
+class GridRegistrationConfig(Config):
+    """How two occupancy maps are matched; "cells" are those of the finest level."""
+
+    method: str = setting(
+        "signed",
+        doc="signed: walls and free space, both ways; paper: mixture of points, one way",
+        choices=("signed", "paper"),
+    )
+    features: str = setting(
+        "walls", doc="points of method paper", choices=("orb", "walls", "both")
+    )
+    sigma_cells: float = setting(1.0, 0.5, 5.0, "walls' kernel, in working cells")
+    free_penalty: float = setting(0.7, 0.0, 2.0, "worth of a wall on free space, walls being 1")
+    max_points: int = setting(300, 20, 5000, "wall points of each map in the search")
+    working_cells: int = setting(90, 20, 400, "longer side of the larger map in the search")
+    finest_cells: int = setting(1000, 100, 4000, "longer side of a map in the refinement")
+    max_side_cells: int = setting(8000, 100, 100000, "maps with a longer side are refused")
+    gap: float = setting(0.05, 0.001, 0.5, "relative gap of the certificate")
+    max_boxes: int = setting(400_000, 1000, 1_000_000_000, "search boxes before giving up")
+    max_seconds: float = setting(20.0, 0.1, 3600.0, "time before giving up [s]; needs a clock")
+    min_wall_cells: int = setting(25, 1, 100000, "fewer wall cells in a map are too few")
+    min_overlap: float = setting(0.1, 0.0, 1.0, "least common seen area, share of the smaller")
+    max_conflict: float = setting(0.5, 0.0, 1.0, "walls on free space, share of common walls")
+    max_rival_share: float = setting(
+        0.9, 0.1, 1.0, "a rival's score from which on it is ambiguous"
+    )
+    min_probability: float = setting(0.9, 0.0, 1.0, "least probability of an accepted match")

@@ -1,0 +1,266 @@
+"""Compiled parts of the registration of grids: the signed fields, their bounds, and the objective.
+
+All positions are [x, y] in working cells, cell centres at whole numbers. A field is a quadratic
+B-spline whose coefficients (R, C) carry a rim of ``pad`` zero cells; it is once continuously
+differentiable, so that both a maximum over a region and a curvature are bounded by tables. Poses:
+the source's points, centred, turn by theta and land at t. Kernels that call each other share this
+file, because numba's cache misses edits in another one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["bound_boxes", "objective", "objective_at"]
+
+FloatGrid = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def _value_gradient(coefficients: FloatGrid, x: float, y: float) -> tuple[float, float, float]:
+    """Field and its gradient [1 / cell] at (x, y), padded coordinates; 0 outside."""
+    num_rows, num_cols = coefficients.shape
+    col, row = math.floor(x + 0.5), math.floor(y + 0.5)
+    if row < 1 or col < 1 or row >= num_rows - 1 or col >= num_cols - 1:
+        return 0.0, 0.0, 0.0
+    dx, dy = x - col, y - row
+    wx0, wx1, wx2 = 0.5 * (0.5 - dx) ** 2, 0.75 - dx * dx, 0.5 * (0.5 + dx) ** 2
+    gx0, gx1, gx2 = dx - 0.5, -2.0 * dx, dx + 0.5
+    value, grad_x, grad_y = 0.0, 0.0, 0.0
+    for k in range(3):
+        if k == 0:
+            wy, gy = 0.5 * (0.5 - dy) ** 2, dy - 0.5
+        elif k == 1:
+            wy, gy = 0.75 - dy * dy, -2.0 * dy
+        else:
+            wy, gy = 0.5 * (0.5 + dy) ** 2, dy + 0.5
+        c0 = coefficients[row - 1 + k, col - 1]
+        c1 = coefficients[row - 1 + k, col]
+        c2 = coefficients[row - 1 + k, col + 1]
+        line = wx0 * c0 + wx1 * c1 + wx2 * c2
+        value += wy * line
+        grad_y += gy * line
+        grad_x += wy * (gx0 * c0 + gx1 * c1 + gx2 * c2)
+    return value, grad_x, grad_y
+
+
+@njit(cache=True, nogil=True)
+def objective(
+    pose: FloatArray,
+    source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
+    target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
+    center: FloatArray, pad: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Objective at pose [theta, t_x, t_y] and its gradient [1 / rad, 1 / cell, 1 / cell].
+
+    ``source`` (M, 2) is relative to ``center``; ``target`` (N, 2) is in target cells.
+    """
+    cos, sin = math.cos(pose[0]), math.sin(pose[0])
+    total, d_theta, d_x, d_y = 0.0, 0.0, 0.0, 0.0
+    for i in range(source.shape[0]):
+        px = cos * source[i, 0] - sin * source[i, 1]
+        py = sin * source[i, 0] + cos * source[i, 1]
+        value, gx, gy = _value_gradient(target_field, px + pose[1] + pad, py + pose[2] + pad)
+        weight = source_weight[i]
+        total += weight * value
+        d_theta += weight * (gy * px - gx * py)
+        d_x += weight * gx
+        d_y += weight * gy
+    for j in range(target.shape[0]):
+        ux, uy = target[j, 0] - pose[1], target[j, 1] - pose[2]
+        qx, qy = cos * ux + sin * uy, cos * uy - sin * ux
+        value, gx, gy = _value_gradient(source_field, qx + center[0] + pad, qy + center[1] + pad)
+        weight = target_weight[j]
+        total += weight * value
+        d_theta += weight * (gx * qy - gy * qx)
+        d_x -= weight * (cos * gx - sin * gy)
+        d_y -= weight * (sin * gx + cos * gy)
+    return total, d_theta, d_x, d_y
+
+
+@njit(cache=True, nogil=True)
+def objective_at(
+    poses: FloatArray,
+    source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
+    target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
+    center: FloatArray, pad: float,
+) -> FloatArray:  # fmt: skip
+    """Objective at many poses (K, 3)."""
+    values = np.empty(poses.shape[0])
+    for k in range(poses.shape[0]):
+        values[k] = objective(
+            poses[k], source, source_weight, target_field,
+            target, target_weight, source_field, center, pad,
+        )[0]  # fmt: skip
+    return values
+
+
+@njit(cache=True, nogil=True)
+def _region_max(
+    tables: NDArray[np.float32], layer_of_width: IntArray, width_of_layer: IntArray,
+    x: float, y: float, half_x: float, half_y: float,
+) -> float:  # fmt: skip
+    """Bound of a table's quantity over (x +- half_x, y +- half_y), padded coordinates."""
+    col, row = math.floor(x - half_x + 0.5), math.floor(y - half_y + 0.5)
+    last_col, last_row = math.floor(x + half_x + 0.5), math.floor(y + half_y + 0.5)
+    num_rows, num_cols = tables.shape[1], tables.shape[2]
+    if last_row < 0 or last_col < 0 or row >= num_rows or col >= num_cols:
+        return 0.0
+    # The rim is as wide as the widest window, so that a window moved to the edge still covers the
+    # same values.
+    row, col = max(row, 0), max(col, 0)
+    width = max(last_row - row, last_col - col) + 1
+    widest = layer_of_width.shape[0] - 1
+    if width <= widest:
+        return tables[layer_of_width[width], row, col]
+    layer = tables.shape[0] - 1
+    step = width_of_layer[layer]
+    best = -math.inf
+    for window_row in range(row, min(last_row + 1, num_rows), step):
+        for window_col in range(col, min(last_col + 1, num_cols), step):
+            best = max(best, tables[layer, window_row, window_col])
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _table_bound(
+    theta: float, t_x: float, t_y: float, half_rad: float, half: float, threshold: float,
+    source: FloatArray, source_weight: FloatArray, target_tables: NDArray[np.float32],
+    target: FloatArray, target_weight: FloatArray, source_tables: NDArray[np.float32],
+    center: FloatArray, pad: float, layer_of_width: IntArray, width_of_layer: IntArray,
+) -> float:  # fmt: skip
+    """Sum of each point's greatest field value over the region that it can reach from the box.
+
+    Gives up early, with a bound that is still true, once the rest cannot lift it over
+    ``threshold``.
+    """
+    cos, sin = math.cos(theta), math.sin(theta)
+    arc, sag = math.sin(min(half_rad, 0.5 * math.pi)), 1.0 - math.cos(half_rad)
+    turned_half = half * min(math.sqrt(2.0), abs(cos) + abs(sin) + math.sqrt(2.0) * half_rad)
+    total, rest = 0.0, 0.0
+    for i in range(source.shape[0]):
+        rest += source_weight[i]
+    for j in range(target.shape[0]):
+        rest += target_weight[j]
+    num = max(source.shape[0], target.shape[0])
+    for k in range(num):
+        if k < source.shape[0]:
+            px = cos * source[k, 0] - sin * source[k, 1]
+            py = sin * source[k, 0] + cos * source[k, 1]
+            total += source_weight[k] * _region_max(
+                target_tables, layer_of_width, width_of_layer, px + t_x + pad, py + t_y + pad,
+                half + abs(py) * arc + abs(px) * sag, half + abs(px) * arc + abs(py) * sag,
+            )  # fmt: skip
+            rest -= source_weight[k]
+        if k < target.shape[0]:
+            ux, uy = target[k, 0] - t_x, target[k, 1] - t_y
+            qx, qy = cos * ux + sin * uy, cos * uy - sin * ux
+            total += target_weight[k] * _region_max(
+                source_tables, layer_of_width, width_of_layer,
+                qx + center[0] + pad, qy + center[1] + pad,
+                turned_half + abs(qy) * arc + abs(qx) * sag,
+                turned_half + abs(qx) * arc + abs(qy) * sag,
+            )  # fmt: skip
+            rest -= target_weight[k]
+        if (k & 15) == 15 and total + rest <= threshold:
+            return total + rest  # no field exceeds 1
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _smooth_bound(
+    theta: float, t_x: float, t_y: float, half_rad: float, half: float,
+    source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
+    target_curvature: NDArray[np.float32],
+    target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
+    source_curvature: NDArray[np.float32],
+    center: FloatArray, pad: float, layer_of_width: IntArray, width_of_layer: IntArray,
+) -> tuple[float, float]:  # fmt: skip
+    """Value at the box's centre, and a second-order bound over the box.
+
+    A point moves by d = J u + e, u the pose's offset; then F(p + d) <= F(p) + dF.J u + |dF| |e| +
+    max(curvature) |d|^2 / 2 with the greatest curvature over the region it reaches. The gradients
+    are summed over all points before their size is taken, which is what makes the bound close
+    quadratically.
+    """
+    cos, sin = math.cos(theta), math.sin(theta)
+    reach_t = math.sqrt(2.0) * half
+    total, rest, g_theta, g_x, g_y = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(source.shape[0]):
+        px = cos * source[i, 0] - sin * source[i, 1]
+        py = sin * source[i, 0] + cos * source[i, 1]
+        radius = math.sqrt(px * px + py * py)
+        reach = reach_t + radius * half_rad
+        x, y = px + t_x + pad, py + t_y + pad
+        curvature = _region_max(
+            target_curvature, layer_of_width, width_of_layer, x, y, reach, reach
+        )
+        value, gx, gy = _value_gradient(target_field, x, y)
+        weight = source_weight[i]
+        total += weight * value
+        g_theta += weight * (gy * px - gx * py)
+        g_x += weight * gx
+        g_y += weight * gy
+        error = 0.5 * radius * half_rad * half_rad
+        rest += weight * (math.sqrt(gx * gx + gy * gy) * error + 0.5 * curvature * reach * reach)
+    for j in range(target.shape[0]):
+        ux, uy = target[j, 0] - t_x, target[j, 1] - t_y
+        qx, qy = cos * ux + sin * uy, cos * uy - sin * ux
+        radius = math.sqrt(qx * qx + qy * qy)
+        reach = reach_t + radius * half_rad
+        x, y = qx + center[0] + pad, qy + center[1] + pad
+        curvature = _region_max(
+            source_curvature, layer_of_width, width_of_layer, x, y, reach, reach
+        )
+        value, gx, gy = _value_gradient(source_field, x, y)
+        weight = target_weight[j]
+        total += weight * value
+        g_theta += weight * (gx * qy - gy * qx)
+        g_x -= weight * (cos * gx - sin * gy)
+        g_y -= weight * (sin * gx + cos * gy)
+        error = 0.5 * radius * half_rad * half_rad + half_rad * reach_t
+        rest += weight * (math.sqrt(gx * gx + gy * gy) * error + 0.5 * curvature * reach * reach)
+    linear = half_rad * abs(g_theta) + half * (abs(g_x) + abs(g_y))
+    return total, total + linear + rest
+
+
+@njit(cache=True, nogil=True)
+def bound_boxes(
+    boxes: FloatArray, parent_bound: FloatArray, half_rad: float, half: float, threshold: float,
+    is_smooth: bool,
+    source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
+    target_tables: NDArray[np.float32], target_curvature: NDArray[np.float32],
+    target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
+    source_tables: NDArray[np.float32], source_curvature: NDArray[np.float32],
+    center: FloatArray, pad: float, layer_of_width: IntArray, width_of_layer: IntArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Upper bounds (K,) over boxes (K, 3) [theta, t_x, t_y] of one size, and values (K,) inside.
+
+    ``half_rad`` and ``half`` are the boxes' half-widths. Values are taken at
+    the centres, and -inf where only the tables were asked.
+    """
+    bounds = np.empty(boxes.shape[0])
+    values = np.full(boxes.shape[0], -np.inf)
+    for k in range(boxes.shape[0]):
+        theta, t_x, t_y = boxes[k, 0], boxes[k, 1], boxes[k, 2]
+        bound = _table_bound(
+            theta, t_x, t_y, half_rad, half, threshold, source, source_weight, target_tables,
+            target, target_weight, source_tables, center, pad, layer_of_width, width_of_layer,
+        )  # fmt: skip
+        bound = min(bound, parent_bound[k])
+        if is_smooth and bound > threshold:
+            values[k], smooth = _smooth_bound(
+                theta, t_x, t_y, half_rad, half,
+                source, source_weight, target_field, target_curvature,
+                target, target_weight, source_field, source_curvature,
+                center, pad, layer_of_width, width_of_layer,
+            )  # fmt: skip
+            bound = min(bound, smooth)
+        bounds[k] = bound
+    return bounds, values

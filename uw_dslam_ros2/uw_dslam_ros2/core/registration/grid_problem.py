@@ -1,0 +1,127 @@
+"""Two maps made ready for matching: points and signed fields of both on one common lattice."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+from uw_dslam_ros2.core.features.walls import wall_points
+from uw_dslam_ros2.core.registration import grid_kernels
+from uw_dslam_ros2.core.registration.signed_field import PAD, SignedField, signed_field
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["GridProblem", "build_problem"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridProblem:
+    """The objective of matching two maps, both directions summed.
+
+    ``f(theta, t) = sum_i w_i F_target(R (x_i - c) + t) + sum_j v_j F_source(R^T (y_j - t) + c)``,
+    where the weights of each side sum to one half, so that 1 is a perfect match. Positions in
+    working cells of ``resolution_m``, cell centres at whole numbers; ``source_points`` are
+    relative to their mean c (``center``). A pose is [theta, t_x, t_y].
+    """
+
+    resolution_m: float
+    source_points: FloatArray
+    source_weights: FloatArray
+    source_field: SignedField
+    target_points: FloatArray
+    target_weights: FloatArray
+    target_field: SignedField
+    center: FloatArray
+    radius: float = field(init=False)  # of the source's points about their mean, root mean square
+
+    def __post_init__(self) -> None:
+        square = (self.source_points**2).sum(axis=1)
+        radius = math.sqrt(float(square.mean())) if len(square) else 0.0
+        object.__setattr__(self, "radius", max(radius, 1.0))
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """Arguments of the kernels after the pose."""
+        return (
+            self.source_points, self.source_weights, self.target_field.coefficients,
+            self.target_points, self.target_weights, self.source_field.coefficients,
+            self.center, float(PAD),
+        )  # fmt: skip
+
+    def value(self, pose: FloatArray) -> float:
+        """Objective at a pose (3,)."""
+        return float(grid_kernels.objective(pose, *self.arguments)[0])
+
+    def ascend(self, pose: FloatArray, max_steps: int = 40) -> tuple[FloatArray, float]:
+        """Local maximum that a pose (3,) climbs to, and its value."""
+        scale = np.array([1.0 / self.radius, 1.0, 1.0])
+
+        def negative(scaled: FloatArray) -> tuple[float, FloatArray]:
+            value, *gradient = grid_kernels.objective(scaled * scale, *self.arguments)
+            return -value, -np.array(gradient) * scale
+
+        start = np.asarray(pose, dtype=np.float64)
+        found = minimize(
+            negative, start / scale, jac=True, method="BFGS", options={"maxiter": max_steps}
+        )
+        value = self.value(start)
+        if -found.fun >= value:
+            return found.x * scale, float(-found.fun)
+        return start, value
+
+    def to_motion(self, pose: FloatArray) -> SE2:
+        """Pose (3,) in working cells to the motion between the grids' own axes [m]."""
+        shift = SE2(0.5 * self.resolution_m, 0.5 * self.resolution_m, 0.0)
+        turned = SE2(
+            float(pose[1]) * self.resolution_m, float(pose[2]) * self.resolution_m, float(pose[0])
+        )
+        center = self.center * self.resolution_m
+        return shift @ turned @ SE2(-center[0], -center[1], 0.0) @ shift.inverse()
+
+    def to_pose(self, T_target_source: SE2) -> FloatArray:
+        """Undo `to_motion`."""
+        shift = SE2(0.5 * self.resolution_m, 0.5 * self.resolution_m, 0.0)
+        center = self.center * self.resolution_m
+        turned = shift.inverse() @ T_target_source @ shift @ SE2(center[0], center[1], 0.0)
+        return np.array([turned.yaw, turned.x / self.resolution_m, turned.y / self.resolution_m])
+
+
+def build_problem(
+    source: CellEvidence,
+    target: CellEvidence,
+    *,
+    stride: int,
+    sigma_cells: float,
+    free_penalty: float,
+    max_points: int,
+) -> GridProblem:
+    """Problem on a lattice ``stride`` times coarser than the cells of both sides.
+
+    ``sigma_cells`` (of the working lattice) is the kernel of the walls.
+    """
+    sides = []
+    for cells in (source, target):
+        points, weights = wall_points(cells, max_points, spacing_cells=float(stride))
+        wide = signed_field(cells, sigma_cells * stride, free_penalty, stride)
+        sides.append((_shuffled(points / stride - 0.5, weights), wide))
+    (source_points, source_weights), source_field = sides[0]
+    (target_points, target_weights), target_field = sides[1]
+    center = np.average(source_points, axis=0, weights=source_weights)
+    return GridProblem(
+        source.resolution_m * stride,
+        np.ascontiguousarray(source_points - center), 0.5 * source_weights, source_field,
+        target_points, 0.5 * target_weights, target_field, center,
+    )  # fmt: skip
+
+
+def _shuffled(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Heavy and light, near and far in turn, so that bounds can give up early."""
+    order = np.random.default_rng(0).permutation(len(points))
+    return np.ascontiguousarray(points[order]), np.ascontiguousarray(weights[order])

@@ -1,0 +1,212 @@
+"""Certified search of the objective of two maps over all of SE(2).
+
+Boxes of poses are halved in all three directions, one size after the other. A box is dropped once
+its bound says that it cannot beat the best pose found by more than the asked gap; what remains
+when the boxes are small is closed by a second-order bound. The certificate holds for the
+continuous objective of `GridProblem`, not for a lattice of poses.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.registration import grid_kernels
+from uw_dslam_ros2.core.registration.grid_problem import GridProblem
+from uw_dslam_ros2.core.registration.signed_field import PAD, bound_tables, layer_lookup
+
+__all__ = ["PoseWindow", "SearchLimits", "SearchOutcome", "search_poses"]
+
+FloatArray = NDArray[np.float64]
+_ROOT_HALF_CELLS = 8.0
+_SMOOTH_FROM_HALF_CELLS = 0.5
+_SMALLEST_HALF_CELLS = 0.01
+_CHUNK = 2048
+_OCTANTS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseWindow:
+    """Box of poses: middle and half-widths, each (3,) [theta, t_x, t_y] in [rad, cells, cells]."""
+
+    middle: FloatArray
+    half: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SearchLimits:
+    """When to stop: relative gap, number of boxes bounded, and a question asked often."""
+
+    gap: float
+    max_boxes: int
+    should_stop: Callable[[], bool] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchOutcome:
+    """Best pose (3,) and proven bounds on the objective's maximum over the window."""
+
+    pose: FloatArray
+    lower_bound: float
+    upper_bound: float
+    is_complete: bool
+    num_boxes: int
+
+
+def whole_plane(problem: GridProblem) -> PoseWindow:
+    """All rotations, and all translations for which points of one side meet the other's field."""
+    reach_points = _greatest_norm(problem.source_points)
+    rows, cols = problem.source_field.coefficients.shape
+    corners = np.array([[0, 0], [cols, 0], [cols, rows], [0, rows]]) - PAD - problem.center
+    reach = max(reach_points, _greatest_norm(corners))
+    num_rows, num_cols = problem.target_field.coefficients.shape
+    size = np.array([num_cols, num_rows]) - 2.0 * PAD
+    low = np.minimum(problem.target_points.min(axis=0), -1.0) - reach
+    high = np.maximum(problem.target_points.max(axis=0), size) + reach
+    half = 0.5 * (high - low)
+    return PoseWindow(np.array([0.0, *(0.5 * (low + high))]), np.array([math.pi, *half]))
+
+
+def _greatest_norm(points: FloatArray) -> float:
+    return float(np.sqrt((points**2).sum(axis=1).max()))
+
+
+def search_poses(
+    problem: GridProblem,
+    window: PoseWindow,
+    start: FloatArray,
+    limits: SearchLimits,
+    report: Callable[[FloatArray, float, float, int, int], None] | None = None,
+) -> SearchOutcome:
+    """Bracket the objective's maximum over a window.
+
+    Parameters
+    ----------
+    start : (3,)
+        A pose inside the window to beat.
+    report
+        Called now and then with pose, lower bound, upper bound, number of boxes bounded, number of
+        open boxes.
+    """
+    search = _Search(problem, start, limits, report)
+    return search.run(window)
+
+
+class _Search:
+    def __init__(
+        self,
+        problem: GridProblem,
+        start: FloatArray,
+        limits: SearchLimits,
+        report: Callable[[FloatArray, float, float, int, int], None] | None,
+    ) -> None:
+        self._problem = problem
+        self._limits = limits
+        self._report = report
+        target_tables, target_curvature = bound_tables(problem.target_field)
+        source_tables, source_curvature = bound_tables(problem.source_field)
+        layer_of_width, width_of_layer = layer_lookup()
+        self._arguments = (
+            problem.source_points, problem.source_weights, problem.target_field.coefficients,
+            target_tables, target_curvature,
+            problem.target_points, problem.target_weights, problem.source_field.coefficients,
+            source_tables, source_curvature,
+            problem.center, float(PAD), layer_of_width, width_of_layer,
+        )  # fmt: skip
+        self._pose = start
+        self._best = problem.value(start)
+        self._dropped = -math.inf  # greatest bound of a dropped box
+        self._num_boxes = 0
+
+    @property
+    def _threshold(self) -> float:
+        """Boxes below this cannot open the gap again."""
+        return self._best / (1.0 - self._limits.gap) if self._best > 0.0 else self._best
+
+    def run(self, window: PoseWindow) -> SearchOutcome:
+        boxes, half_rad, half = _roots(window, self._problem.radius)
+        parents = np.full(len(boxes), np.inf)
+        while len(boxes):
+            kept = self._bound_level(boxes, parents, half_rad, half)
+            if kept is None:
+                return self._outcome(False)
+            boxes, bounds = kept
+            if half < _SMALLEST_HALF_CELLS:
+                self._dropped = max(self._dropped, float(bounds.max(initial=-math.inf)))
+                break
+            half_rad, half = 0.5 * half_rad, 0.5 * half
+            steps = _OCTANTS * (2.0 * half_rad, 2.0 * half, 2.0 * half)
+            boxes = (boxes[:, None, :] + steps).reshape(-1, 3)
+            parents = np.repeat(bounds, 8)
+        return self._outcome(True)
+
+    def _bound_level(
+        self, boxes: FloatArray, parents: FloatArray, half_rad: float, half: float
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Open boxes, promising ones first, and their bounds; None where the budget ran out."""
+        is_smooth = half <= _SMOOTH_FROM_HALF_CELLS
+        kept_boxes, kept_bounds = [np.empty((0, 3))], [np.empty(0)]
+        num_kept = 0
+        for first in range(0, len(boxes), _CHUNK):
+            chunk = slice(first, first + _CHUNK)
+            if self._is_out_of_budget():
+                rest = float(parents[first:].max())
+                open_bounds = [float(b.max(initial=-math.inf)) for b in kept_bounds]
+                self._dropped = max(self._dropped, rest, *open_bounds)
+                return None
+            bounds, values = grid_kernels.bound_boxes(
+                boxes[chunk], parents[chunk], half_rad, half, self._threshold, is_smooth,
+                *self._arguments,
+            )  # fmt: skip
+            self._num_boxes += len(bounds)
+            self._improve(boxes[chunk], values)
+            is_open = bounds > self._threshold
+            self._dropped = max(self._dropped, float(bounds[~is_open].max(initial=-math.inf)))
+            kept_boxes.append(boxes[chunk][is_open])
+            kept_bounds.append(bounds[is_open])
+            num_kept += int(is_open.sum())
+            self._tell(parents[first:], kept_bounds, num_kept + len(boxes) - first - len(bounds))
+        bounds = np.concatenate(kept_bounds)
+        order = np.argsort(-bounds, kind="stable")
+        return np.concatenate(kept_boxes)[order], bounds[order]
+
+    def _improve(self, boxes: FloatArray, values: FloatArray) -> None:
+        index = int(values.argmax())
+        if values[index] > self._best:
+            self._pose, self._best = self._problem.ascend(boxes[index])
+
+    def _is_out_of_budget(self) -> bool:
+        should_stop = self._limits.should_stop
+        return self._num_boxes >= self._limits.max_boxes or (
+            should_stop is not None and should_stop()
+        )
+
+    def _tell(self, parents: FloatArray, kept: list[FloatArray], num_open: int) -> None:
+        if self._report is None:
+            return
+        open_bounds = [float(b.max(initial=-math.inf)) for b in kept]
+        upper = max(self._best, self._dropped, float(parents.max()), *open_bounds)
+        self._report(self._pose, self._best, min(upper, 1.0), self._num_boxes, num_open)
+
+    def _outcome(self, is_complete: bool) -> SearchOutcome:
+        upper = min(max(self._best, self._dropped), 1.0)
+        return SearchOutcome(self._pose, self._best, upper, is_complete, self._num_boxes)
+
+
+def _roots(window: PoseWindow, radius: float) -> tuple[FloatArray, float, float]:
+    """Equal boxes that cover the window, and their half-widths; turns move the rim like shifts."""
+    half = min(_ROOT_HALF_CELLS, float(window.half[1:].max()))
+    num_x, num_y = (math.ceil(float(size) / half - 1e-9) for size in window.half[1:])
+    num_theta = math.ceil(float(window.half[0]) * radius / half)
+    half_rad = float(window.half[0]) / num_theta
+    axes = [
+        window.middle[axis] + step * (2.0 * np.arange(num) - (num - 1))
+        for axis, (num, step) in enumerate(((num_theta, half_rad), (num_x, half), (num_y, half)))
+    ]
+    grid = np.meshgrid(*axes, indexing="ij")
+    return np.column_stack([axis.ravel() for axis in grid]), half_rad, half

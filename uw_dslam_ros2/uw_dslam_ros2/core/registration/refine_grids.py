@@ -1,0 +1,132 @@
+"""What two maps say about each other at a pose, and how well they fix it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+from uw_dslam_ros2.core.registration import grid_kernels
+from uw_dslam_ros2.core.registration.grid_problem import GridProblem
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["Agreement", "curvature", "measure_agreement", "pose_covariance"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """What two maps say about each other at a pose.
+
+    ``overlap`` is the area seen by both over the smaller seen area. Of the wall cells of either
+    map inside the other's seen area (``num_walls``), ``agreement`` is the share with a wall near
+    and ``conflict`` the share on free space with none near. ``num_source_inliers`` of
+    ``num_source_walls`` wall cells have a partner. ``residual_cells`` is the root mean square
+    distance of the partners.
+    """
+
+    overlap: float
+    num_walls: int
+    agreement: float
+    conflict: float
+    inlier_ratio: float
+    residual_cells: float
+
+
+class WallMap:
+    """Distance to walls, free share and walls of a map, made once for all poses."""
+
+    def __init__(self, cells: CellEvidence) -> None:
+        self.cells = cells
+        is_wall = cells.wall > 0.25
+        self.distance = cv2.distanceTransform(
+            (~is_wall).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+        )
+        self.free = cv2.boxFilter(cells.free, -1, (3, 3), borderType=cv2.BORDER_CONSTANT)
+        self.known = cells.known > 0.5
+        rows, cols = np.nonzero(is_wall)
+        self.points = np.column_stack([cells.col[rows, cols], cells.row[rows, cols]]).astype(
+            np.float64
+        )
+
+    def at(self, points: FloatArray) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+        """Known, distance [cells] and free share under points (N, 2) in cells; unknown outside."""
+        cells = np.floor(points[:, ::-1]).astype(np.int64)
+        inside = (cells >= 0).all(axis=1) & (cells < self.known.shape).all(axis=1)
+        row, col = np.where(inside[:, None], cells, 0).T
+        known = np.where(inside, self.known[row, col], False)
+        return known, self.distance[row, col].astype(np.float64), self.free[row, col]
+
+
+_NEAR_CELLS = 2.5
+_FAR_CELLS = 3.5
+
+
+def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreement:
+    """Agreement of two maps of one resolution; ``T_cells`` maps source to target cells [x, y]."""
+    seen, near, conflict, square, inliers = 0, 0, 0, 0.0, 0.0
+    for walls, other, motion in ((source, target, T_cells), (target, source, T_cells.inverse())):
+        known, distance, free = other.at(motion.apply(walls.points))
+        is_near = known & (distance <= _NEAR_CELLS)
+        seen += int(known.sum())
+        near += int(is_near.sum())
+        square += float((distance[is_near] ** 2).sum())
+        conflict += int((known & (distance > _FAR_CELLS) & (free > 0.6)).sum())
+        if walls is source:
+            inliers = float(is_near.mean()) if len(is_near) else 0.0
+    return Agreement(
+        _overlap(source, target, T_cells),
+        seen,
+        near / max(seen, 1),
+        conflict / max(seen, 1),
+        inliers,
+        float(np.sqrt(square / max(near, 1))),
+    )
+
+
+def _overlap(source: WallMap, target: WallMap, T_cells: SE2) -> float:
+    rows, cols = target.known.shape
+    matrix = T_cells.matrix()[:2].copy()
+    matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts from cell centres
+    moved = cv2.warpAffine(
+        source.known.astype(np.uint8), matrix, (cols, rows), flags=cv2.INTER_NEAREST
+    )
+    both = int((target.known & (moved > 0)).sum())
+    smaller = min(int(source.known.sum()), int(target.known.sum()))
+    return min(both / max(smaller, 1), 1.0)
+
+
+def curvature(problem: GridProblem, pose: FloatArray) -> FloatArray:
+    """Negative Hessian (3, 3) of the objective, theta in cells at the rim."""
+    scale = np.array([1.0 / problem.radius, 1.0, 1.0])
+    step = 0.25
+    hessian = np.empty((3, 3))
+    for axis in range(3):
+        offset = np.zeros(3)
+        offset[axis] = step
+        ahead = np.array(grid_kernels.objective(pose + offset * scale, *problem.arguments)[1:])
+        behind = np.array(grid_kernels.objective(pose - offset * scale, *problem.arguments)[1:])
+        hessian[axis] = (ahead - behind) * scale / (2.0 * step)
+    return -0.5 * (hessian + hessian.T)
+
+
+def pose_covariance(
+    problem: GridProblem, pose: FloatArray, num_pairs: float, sigma_cells: float
+) -> FloatArray:
+    """Covariance (3, 3) of [theta, t_x, t_y] in [rad, cells] from the objective's curvature.
+
+    The objective is a sum of exp(-d^2 / 2 s^2), whose curvature is that of the squared distances
+    over s^2.
+    """
+    hessian = curvature(problem, pose)
+    values, vectors = np.linalg.eigh(hessian)
+    # Directions that the maps do not fix at all get the size of the map, not infinity.
+    floor = max(float(values.max()), 1e-9) * 1e-5
+    information = np.maximum(values, floor) / max(problem.value(pose), 1e-6) * num_pairs
+    inverse = vectors @ np.diag(1.0 / (information * sigma_cells**2)) @ vectors.T
+    scale = np.diag([1.0 / problem.radius, 1.0, 1.0])
+    return scale @ inverse @ scale

@@ -1,0 +1,117 @@
+"""The signed field of a map: walls positive, free space negative, unknown zero; its bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+
+__all__ = ["PAD", "SignedField", "bound_tables", "layer_lookup", "signed_field"]
+
+FloatGrid = NDArray[np.float32]
+
+WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32)
+"""Windows, in cells, over which the tables hold maxima."""
+PAD = WIDTHS[-1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SignedField:
+    """A field on working cells: B-spline coefficients (R + 2 PAD, C + 2 PAD), at most 1."""
+
+    coefficients: FloatGrid
+
+
+def signed_field(
+    cells: CellEvidence, sigma_cells: float, free_penalty: float, stride: int = 1
+) -> SignedField:
+    """Field of a map's cells, on a lattice ``stride`` times coarser.
+
+    A wall is worth exp(-d^2 / (2 sigma^2)) at distance d, free space -``free_penalty`` times its
+    share of the neighbourhood, less as a wall comes near. ``sigma_cells`` is in cells of
+    ``cells``.
+    """
+    is_wall = cells.wall > 0.25
+    if is_wall.any():
+        distance = cv2.distanceTransform(
+            (~is_wall).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+        )
+        near = np.exp(distance**2 * np.float32(-0.5 / sigma_cells**2))
+    else:
+        near = np.zeros(cells.shape, np.float32)
+    free = cv2.boxFilter(cells.free, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
+    field = near - np.float32(free_penalty) * free * (np.float32(1.0) - near)
+    # Nothing is known beyond the edge of a map, not even that a wall's kernel reaches there.
+    if stride > 1:
+        field = _decimate(field, stride)
+    return SignedField(np.pad(field, PAD).astype(np.float32))
+
+
+def _decimate(field: FloatGrid, stride: int) -> FloatGrid:
+    """Mean over ``stride`` x ``stride`` cells; the last ones are filled with zeros."""
+    rows, cols = (-(-size // stride) * stride for size in field.shape)
+    padded = np.zeros((rows, cols), np.float32)
+    padded[: field.shape[0], : field.shape[1]] = field
+    blocks = padded.reshape(rows // stride, stride, cols // stride, stride)
+    mean: FloatGrid = blocks.mean(axis=(1, 3)).astype(np.float32)
+    return mean
+
+
+def layer_lookup() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For each width in cells the first table that covers it; and the tables' widths."""
+    widths = np.array(WIDTHS, dtype=np.int64)
+    return np.searchsorted(widths, np.arange(widths[-1] + 1)).astype(np.int64), widths
+
+
+def bound_tables(field: SignedField) -> tuple[FloatGrid, FloatGrid]:
+    """Upper bounds of field and curvature [1 / cell^2] over windows of `WIDTHS` cells.
+
+    Each is (num_widths, R, C); entry [k, row, col] holds for the cells row..row + width - 1 and
+    likewise for columns. Within a cell the spline is a polynomial inside the hull of its nine
+    Bezier coefficients; its second derivatives are inside the hull of the coefficients' second
+    differences.
+    """
+    c = field.coefficients
+    value = _bezier_max(c)
+    curvature = _curvature_max(c)
+    tables = np.empty((2, len(WIDTHS), *c.shape), np.float32)
+    for layer, width in enumerate(WIDTHS):
+        window = np.ones((width, width), np.uint8)
+        for kind, base in enumerate((value, curvature)):
+            tables[kind, layer] = cv2.dilate(base, window, anchor=(0, 0))
+    return tables[0], tables[1]
+
+
+def _bezier_max(c: FloatGrid) -> FloatGrid:
+    """Maximum over a cell's Bezier coefficients, each a mean of one, two or four coefficients."""
+    half = np.float32(0.5)
+    best = c.copy()
+    p = np.pad(c, 1)
+    lines = [p[:, 1:-1], half * (p[:, :-2] + p[:, 1:-1]), half * (p[:, 1:-1] + p[:, 2:])]
+    for line in lines:
+        np.maximum(best, line[1:-1], out=best)
+        np.maximum(best, half * (line[:-2] + line[1:-1]), out=best)
+        np.maximum(best, half * (line[1:-1] + line[2:]), out=best)
+    # Kernels compute in double precision from the same single-precision coefficients.
+    return best + np.float32(1e-6)
+
+
+def _curvature_max(c: FloatGrid) -> FloatGrid:
+    """Bound of the greatest eigenvalue of a cell's Hessian, at least 0."""
+    p = np.pad(c, 2)
+    inner = np.pad(c, 1)
+    xx = p[1:-1, :-2] - np.float32(2.0) * p[1:-1, 1:-1] + p[1:-1, 2:]  # of rows -1..R, cols -1..C
+    yy = p[:-2, 1:-1] - np.float32(2.0) * p[1:-1, 1:-1] + p[2:, 1:-1]
+    xx = np.maximum(np.maximum(xx[:-2, 1:-1], xx[1:-1, 1:-1]), xx[2:, 1:-1])
+    yy = np.maximum(np.maximum(yy[1:-1, :-2], yy[1:-1, 1:-1]), yy[1:-1, 2:])
+    # Mixed derivative: bilinear in the four corner differences of the 3 x 3 coefficients around a
+    # cell.
+    cross = np.abs(inner[:-1, :-1] - inner[:-1, 1:] - inner[1:, :-1] + inner[1:, 1:])
+    xy = np.maximum(
+        np.maximum(cross[:-1, :-1], cross[:-1, 1:]), np.maximum(cross[1:, :-1], cross[1:, 1:])
+    )
+    return np.maximum(np.maximum(xx, yy) + xy, np.float32(0.0)) + np.float32(1e-6)
