@@ -287,6 +287,7 @@ def _answer_to_plain(answer: Answer) -> dict[str, Any]:
         "T_target_source": answer.T_target_source.as_array().tolist(),
         "covariance": answer.covariance.tolist(),
         "probability": answer.probability,
+        "numbers": answer.numbers,
     }
 
 
@@ -304,6 +305,7 @@ def _answer_from_plain(plain: dict[str, Any]) -> Answer:
         SE2(*plain["T_target_source"]),
         np.array(plain["covariance"], dtype=np.float64),
         plain["probability"],
+        plain["numbers"],
     )
 
 

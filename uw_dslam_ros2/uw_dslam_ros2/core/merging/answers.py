@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +11,10 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance
 from uw_dslam_ros2.core.merging.units import StoredSubmap, Unit, shared_area_m2
-from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
+from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["Answer", "Match", "MatchKey", "edge_of"]
+__all__ = ["Answer", "Match", "MatchKey", "edge_of", "numbers_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -45,6 +46,7 @@ class Answer:
     T_target_source: SE2
     covariance: FloatArray
     probability: float
+    numbers: dict[str, float] = field(default_factory=dict)  # of the result, for reports
 
     @property
     def is_accepted(self) -> bool:
@@ -61,6 +63,26 @@ class Answer:
             and abs(found.y - guess.y) <= 1.1 * prior.half_width_m
             and abs(wrap_angle(found.yaw - guess.yaw)) <= 1.1 * prior.half_width_rad
         )
+
+
+_NUMBERS = (
+    "score",
+    "lower_bound",
+    "upper_bound",
+    "is_certified",
+    "num_boxes",
+    "overlap",
+    "conflict_ratio",
+    "inlier_ratio",
+    "num_source_points",
+    "num_target_points",
+)
+
+
+def numbers_of(result: RegistrationResult) -> dict[str, float]:
+    """Proof and measurements of a result by name, where known; no times, which differ each run."""
+    values = {name: float(getattr(result, name)) for name in _NUMBERS}
+    return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
 def edge_of(

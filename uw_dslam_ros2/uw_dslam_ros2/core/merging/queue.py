@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
 from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
-from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
+from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, numbers_of
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
 from uw_dslam_ros2.core.merging.graph import residual
@@ -112,6 +112,7 @@ class MapQueue:
             result.T_target_source,
             covariance,
             result.probability,
+            numbers_of(result),
         )
         self._change()
 
@@ -162,6 +163,15 @@ class MapQueue:
             self._record(submap_id, *place[submap_id], tries.get(submap_id[0], 0))
             for submap_id in sorted(self._submaps)
         ]
+
+    def answers(self) -> list[tuple[Answer, bool]]:
+        """All answers, by target and source, and whether each holds in the pose graph."""
+        used = {joint.key for joint in self._plan().joints if joint.is_inlier}
+        by_question = sorted(
+            self._answers.values(),
+            key=lambda a: (a.match.target.ids, a.match.source.ids, a.match.key),
+        )
+        return [(answer, answer.match.key in used) for answer in by_question]
 
     def constraints(self) -> list[Constraint]:
         """All edges of the pose graph with what is left of them after optimisation."""
