@@ -49,9 +49,10 @@ class MissionConfig(Config):
     seed: int = setting(0, 0, 2**31 - 1, "a different place and mission for every seed")
     place: str = setting("harbour", choices=PLACES, doc="kind of place")
     num_vehicles: int = setting(3, 1, 20, "vehicles")
+    place_width_m: float = setting(0.0, 0.0, 2000.0, "0: by the number of vehicles [m]")
     duration_s: float = setting(200.0, 2.0, 7200.0, "length of each recording [s]")
     overlap: float = setting(
-        0.35, 0.0, 0.95, "part of an area's width that the next vehicle surveys too"
+        0.3, 0.0, 0.95, "part of an area's width that the next vehicle surveys too"
     )
     clearance_m: float = setting(4.0, 1.0, 20.0, "distance kept from walls [m]")
     ping_rate_hz: float = setting(3.0, 0.2, 30.0, "sonar pings per second")
@@ -65,7 +66,8 @@ def tiny_mission_config(seed: int = 0) -> MissionConfig:
     return MissionConfig(
         seed=seed,
         num_vehicles=2,
-        duration_s=40.0,
+        place_width_m=60.0,
+        duration_s=60.0,
         overlap=0.9,
         ping_rate_hz=2.0,
         truth_resolution_m=0.1,
@@ -106,7 +108,7 @@ class Mission:
 
 def plan_mission(config: MissionConfig) -> Mission:
     """Build the place, send the vehicles through it, and sample their instruments."""
-    world = make_place(config.place, config.seed, config.num_vehicles)
+    world = make_place(config.place, config.seed, config.num_vehicles, config.place_width_m)
     areas = split_areas(world, config.num_vehicles, config.overlap)
     runs = [_run(config, world, area, index) for index, area in enumerate(areas)]
     return Mission(config, world, tuple(runs))
@@ -153,8 +155,7 @@ class PingMaker:
 def every_metre(run: VehicleRun) -> NDArray[np.float64]:
     """Sonar poses (K, 3) of a run, thinned to one for about each metre or ten degrees."""
     poses = run.sonar_poses()
-    moved = np.hypot(*np.diff(poses[:, :2], axis=0).T) + np.abs(
-        np.diff(poses[:, 2])
-    ) / math.radians(10.0)
+    moved = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    moved += np.abs(np.diff(np.unwrap(poses[:, 2]))) / math.radians(10.0)
     keys = np.floor(np.concatenate([[0.0], np.cumsum(moved)]))
     return poses[np.unique(keys, return_index=True)[1]]

@@ -34,7 +34,7 @@ class SurveyArea:
 
 
 def split_areas(world: World, num_vehicles: int, overlap: float) -> list[SurveyArea]:
-    """Areas side by side along x; each shares the part `overlap` of its width with its neighbour."""
+    """Areas side by side along x; neighbours share the part `overlap` of their width."""
     x_min, y_min, x_max, y_max = world.bounds
     width = (x_max - x_min) / (1.0 + (num_vehicles - 1) * (1.0 - overlap))
     starts = x_min + np.arange(num_vehicles) * width * (1.0 - overlap)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -25,19 +26,20 @@ RUBBLE = Surface("rubble", -8.0, 0.0)
 BANK = Surface("bank", -11.0, 0.0)
 
 
-def make_place(place: str, seed: int, num_vehicles: int = 3) -> World:
-    """Build a place large enough for a number of vehicles."""
+def make_place(place: str, seed: int, num_vehicles: int = 3, width_m: float = 0.0) -> World:
+    """Build a place of a width; 0 makes it large enough for a number of vehicles."""
     if place == "harbour":
-        return make_harbour(seed, num_vehicles)
+        return make_harbour(seed, num_vehicles, width_m)
     if place == "lake":
-        return make_lake(seed, num_vehicles)
+        return make_lake(seed, num_vehicles, width_m)
     raise InvalidInputError(f"place is {place!r}, expected one of {', '.join(PLACES)}")
 
 
-def make_harbour(seed: int, num_vehicles: int = 3) -> World:
+def make_harbour(seed: int, num_vehicles: int = 3, width_m: float = 0.0) -> World:
     """Build a basin of quay walls with piers, piles, a moored hull, rocks and a breakwater."""
     rng = np.random.default_rng([seed, 1])
-    width = 55.0 + 40.0 * num_vehicles + rng.uniform(-5.0, 5.0)
+    width = (width_m or 40.0 + 35.0 * num_vehicles) + rng.uniform(-5.0, 5.0)
+    num_things = max(1, round((width - 40.0) / 35.0))
     height = rng.uniform(62.0, 75.0)
     builder = WorldBuilder()
     # Land on three sides, the breakwater on the fourth: the mouth is in its line.
@@ -52,19 +54,19 @@ def make_harbour(seed: int, num_vehicles: int = 3) -> World:
     )
     _add_quay(builder, rng, outline)
     _add_breakwater(builder, rng, width, height)
-    slots = _slots(rng, width, num_vehicles)
+    slots = _slots(rng, width, num_things)
     for i, x in enumerate(slots):
         (_add_pier, _add_piled_jetty, _add_hull)[i % 3](builder, rng, x)
-    for x in rng.uniform(12.0, width - 12.0, size=3 + 2 * num_vehicles):
+    for x in rng.uniform(12.0, width - 12.0, size=3 + 2 * num_things):
         _add_dolphin(builder, rng, (x, rng.uniform(0.35, 0.9) * height))
-    for x in rng.uniform(8.0, width - 8.0, size=4 + 2 * num_vehicles):
+    for x in rng.uniform(8.0, width - 8.0, size=4 + 2 * num_things):
         _add_rock(builder, rng, (x, rng.uniform(0.3, 0.95) * height), rng.uniform(0.4, 1.8))
     water_point = (0.5 * width, 0.6 * height)
     return builder.build("harbour", seed, water_point, 8.0)
 
 
 def _jagged_side(rng: np.random.Generator, length: float) -> FloatArray:
-    """Points (N, 2) along a quay from (0, 0) to (length, 0), with steps of up to 7 m into y > 0."""
+    """Points (N, 2) of a quay from (0, 0) to (length, 0), with steps of up to 7 m to y > 0."""
     points = [(0.0, 0.0)]
     x, depth = 0.0, 0.0
     while length - x > 26.0:
@@ -82,7 +84,7 @@ def _jagged_side(rng: np.random.Generator, length: float) -> FloatArray:
 
 def _add_quay(builder: WorldBuilder, rng: np.random.Generator, outline: FloatArray) -> None:
     """Quay wall with fenders and ladder recesses at uneven distances; water lies to its left."""
-    for start, end in zip(outline[:-1], outline[1:], strict=True):
+    for start, end in itertools.pairwise(outline):
         length = float(np.hypot(*(end - start)))
         if length < 1e-6:
             continue
@@ -128,9 +130,9 @@ def _add_breakwater(
         builder.add(RUBBLE, head)
 
 
-def _slots(rng: np.random.Generator, width: float, num_vehicles: int) -> FloatArray:
+def _slots(rng: np.random.Generator, width: float, num_things: int) -> FloatArray:
     """Places along the south quay for piers, jetties and hulls, apart from each other."""
-    count = 2 + 2 * num_vehicles
+    count = 2 + 2 * num_things
     step = (width - 24.0) / count
     slots = 12.0 + step * (np.arange(count) + 0.5) + rng.uniform(-0.2, 0.2, count) * step
     return rng.permutation(slots)
@@ -202,10 +204,11 @@ def _add_rock(
     builder.add(ROCK, _placed(shape, center, rng.uniform(0.0, math.pi)), is_closed=True)
 
 
-def make_lake(seed: int, num_vehicles: int = 3) -> World:
+def make_lake(seed: int, num_vehicles: int = 3, width_m: float = 0.0) -> World:
     """Build an open lake bed: a winding bank on one side, a few boulders, a wreck, stakes."""
     rng = np.random.default_rng([seed, 2])
-    width = 60.0 + 35.0 * num_vehicles
+    width = width_m or 40.0 + 35.0 * num_vehicles
+    num_things = max(1, round((width - 40.0) / 35.0))
     height = rng.uniform(60.0, 75.0)
     builder = WorldBuilder()
     xs = np.arange(-10.0, width + 10.0, 1.5)
@@ -215,7 +218,7 @@ def make_lake(seed: int, num_vehicles: int = 3) -> World:
         a * np.sin(2.0 * math.pi * xs / w + p) for (a, w), p in zip(waves, phases, strict=True)
     )
     builder.add(BANK, np.column_stack([xs, bank + rng.normal(0.0, 0.15, len(xs))]))
-    for _ in range(2 + 2 * num_vehicles):
+    for _ in range(2 + 2 * num_things):
         center = (rng.uniform(5.0, width - 5.0), rng.uniform(16.0, height - 5.0))
         for _ in range(rng.integers(1, 6)):
             spot = (center[0] + rng.normal(0.0, 2.5), center[1] + rng.normal(0.0, 2.5))
@@ -226,7 +229,7 @@ def make_lake(seed: int, num_vehicles: int = 3) -> World:
     port = np.column_stack([side * 12.0 - 6.0, beam])
     hull = np.vstack([port, port[-2::-1] * (1.0, -1.0)])
     builder.add(TIMBER, _placed(hull, wreck, rng.uniform(0.0, math.pi)), is_closed=True)
-    for x in rng.uniform(5.0, width - 5.0, 2 * num_vehicles):
+    for x in rng.uniform(5.0, width - 5.0, 2 * num_things):
         builder.add(TIMBER, _circle((x, rng.uniform(9.0, 16.0)), 0.15, 6), is_closed=True)
     return builder.build("lake", seed, (0.5 * width, height - 2.0), 7.0)
 

@@ -36,7 +36,7 @@ def _trace(
 ) -> None:
     """Set every cell that the line from (x0, y0) to (x1, y1) passes through; units of cells."""
     num_rows, num_cols = counts.shape
-    col, row = int(math.floor(x0)), int(math.floor(y0))
+    col, row = math.floor(x0), math.floor(y0)
     dx, dy = x1 - x0, y1 - y0
     step_col = 1 if dx > 0.0 else -1
     step_row = 1 if dy > 0.0 else -1

@@ -64,7 +64,7 @@ class RecordedMission:
 
 def simulate_mission(
     folder: str | Path,
-    config: MissionConfig = MissionConfig(),
+    config: MissionConfig,
     *,
     storage: str = "mcap",
     num_processes: int = 1,
@@ -273,16 +273,14 @@ def _write_truth(folder: Path, mission: Mission) -> None:
         seen_map(world, spec, every_metre(run), config.sonar.fov_rad, config.sonar.max_range_m)
         for run in mission.runs
     ]
-    values = np.max([m.values for m in seen], axis=0)
+    values = np.stack([m.values for m in seen]).max(axis=0).astype(np.int8)
     write_map(folder / "map", OccupancyMap(spec, values))
     for run in mission.runs:
         motion = run.motion
         write_tum(
             folder / f"{run.vehicle_id}.tum",
             motion.stamp_ns[::_TRUTH_RATE_STEP],
-            np.array(
-                [motion.pose(i).as_array() for i in range(0, len(motion.poses), _TRUTH_RATE_STEP)]
-            ),
+            motion.poses[::_TRUTH_RATE_STEP],
         )
     outline = {
         "frame": "map",

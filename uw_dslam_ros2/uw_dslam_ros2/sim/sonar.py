@@ -58,7 +58,7 @@ class SonarConfig(Config):
 
 
 class SonarSimulator:
-    """Makes pings of one place with one sonar; all randomness comes from the caller's generator."""
+    """Makes pings of one place with one sonar; randomness comes from the caller's generator."""
 
     def __init__(self, world: World, config: SonarConfig = SonarConfig()) -> None:
         self.config = config
@@ -67,14 +67,14 @@ class SonarSimulator:
         # Port first: the way the instrument's y axis (to starboard) counts.
         self.bearing_rad: FloatArray = np.linspace(half, -half, config.num_beams)
         self._bin_m = config.max_range_m / config.num_ranges
-        self.range_m: FloatArray = (np.arange(config.num_ranges) + 0.5) * self._bin_m
+        self.range_m = (np.arange(config.num_ranges, dtype=np.float64) + 0.5) * self._bin_m
         spacing = config.fov_rad / (config.num_beams - 1)
         # Rays also beyond the edges: what lies there leaks in through the beams' flanks.
         num_extra = math.ceil(2.0 * config.beam_width_rad / spacing)
         count = (config.num_beams + 2 * num_extra) * _RAYS_PER_BEAM
         edge = half + (num_extra + 0.5) * spacing
         self._ray_step = 2.0 * edge / count
-        self._ray_rad: FloatArray = edge - (np.arange(count) + 0.5) * self._ray_step
+        self._ray_rad = edge - (np.arange(count, dtype=np.float64) + 0.5) * self._ray_step
         self._response = self._beam_response()
         self._speckle_taps = _amplitude_taps(spacing, config.beam_width_rad)
         self._noise = self._noise_power()
@@ -105,7 +105,7 @@ class SonarSimulator:
     def ping(
         self, stamp_ns: int, T_map_sonar: SE2, depth_m: float, rng: np.random.Generator
     ) -> SonarImage:
-        """Return the image (8 bit) of one ping from a pose in the world, at a depth below the surface."""
+        """Return the 8-bit image of one ping from a pose in the world and a depth."""
         power = self._mean_power(T_map_sonar, depth_m, rng)
         speckle = filter_beams(
             rng.standard_normal((2, *power.shape), dtype=np.float32), self._speckle_taps

@@ -44,8 +44,8 @@ def add_echoes(
         start = ranges[k] / bin_m
         box = widths[k] / bin_m
         tail = tails[k] / bin_m
-        first = int(math.floor(start - 0.5 * box))
-        last = int(math.floor(start + 0.5 * box + 3.0 * tail))
+        first = math.floor(start - 0.5 * box)
+        last = math.floor(start + 0.5 * box + 3.0 * tail)
         last = min(last, first + _MAX_BINS - 1, num_ranges - 1)
         level = strength[k] / max(1.0, box)
         for b in range(first, last + 1):
@@ -98,7 +98,7 @@ def add_seabed(
                 break
             x = (origin[0] + r * cos - texture_origin[0]) / texture_step_m
             y = (origin[1] + r * sin - texture_origin[1]) / texture_step_m
-            col, row = int(math.floor(x)), int(math.floor(y))
+            col, row = math.floor(x), math.floor(y)
             u, v = x - col, y - row
             # The texture repeats beyond the place.
             row0, row1 = row % num_rows, (row + 1) % num_rows

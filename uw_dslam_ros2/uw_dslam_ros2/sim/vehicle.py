@@ -108,7 +108,7 @@ def drive(
         If the route ends before the time does.
     """
     num_samples = math.ceil(duration_s * rate_hz) + 1
-    s, speeds = _speed_profile(route, config, rng)
+    s, headings, speeds = _profile(route, config, rng)
     times = np.concatenate([[0.0], np.cumsum(np.diff(s) * 2.0 / (speeds[1:] + speeds[:-1]))])
     if times[-1] < duration_s:
         raise InvalidInputError(
@@ -120,10 +120,8 @@ def drive(
     # Half a second of inertia, and so smooth derivatives.
     progress = gaussian_filter1d(progress, 0.5 * rate_hz, mode="nearest")
     x, y = CubicSpline(s, route, axis=0)(progress).T
-    tangent = CubicSpline(s, route, axis=0)(progress, 1)
     crab = 0.04 * np.sin(2.0 * math.pi * t / rng.uniform(11.0, 19.0) + rng.uniform(0.0, 6.0))
-    yaw = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])) + crab
-    yaw = gaussian_filter1d(yaw, 0.3 * rate_hz, mode="nearest")
+    yaw = crab + gaussian_filter1d(np.interp(progress, s, headings), 0.3 * rate_hz, mode="nearest")
     v_world = np.gradient(np.column_stack([x, y]), 1.0 / rate_hz, axis=0)
     cos, sin = np.cos(yaw), np.sin(yaw)
     forward = cos * v_world[:, 0] + sin * v_world[:, 1]
@@ -138,18 +136,22 @@ def drive(
     )
 
 
-def _speed_profile(
+def _profile(
     route: FloatArray, config: NavigationConfig, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Arc lengths (N,) [m] of a route's points, and the speed (N,) [m/s] at each."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Arc length (N,) [m], heading (N,) [rad] and speed (N,) [m/s] along a route.
+
+    The heading is the course, smoothed: where the route turns back on itself the vehicle slows
+    down and turns while it drifts on, as one with thrusters on all sides does.
+    """
     s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(route, axis=0).T))])
-    d1, d2 = np.gradient(route, s, axis=0), np.gradient(np.gradient(route, s, axis=0), s, axis=0)
-    curvature = np.abs(d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])
+    course = np.unwrap(np.arctan2(*np.gradient(route, s, axis=0).T[::-1]))
+    headings = gaussian_filter1d(course, 1.2 / s[1], mode="nearest")
+    turn = np.abs(np.gradient(headings, s))
     whim = 1.0 + 0.1 * np.sin(2.0 * math.pi * s / rng.uniform(20.0, 50.0) + rng.uniform(0.0, 6.0))
-    cruise = config.speed_m_s * whim
-    limit = config.max_yaw_rate_rad_s / np.maximum(curvature, 1e-9)
-    speeds = np.clip(np.minimum(cruise, limit), 0.15 * config.speed_m_s, None)
-    return s, gaussian_filter1d(speeds, 4.0, mode="nearest")
+    limit = config.max_yaw_rate_rad_s / np.maximum(turn, 1e-9)
+    speeds = np.minimum(config.speed_m_s * whim, limit)
+    return s, headings, gaussian_filter1d(speeds, 1.0 / s[1], mode="nearest")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -59,8 +60,10 @@ class World:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayHits:
-    """First hits of K rays: range (K,) [m] (inf: none), segment (K,) (`NO_HIT`), cosine of the
-    angle of incidence (K,), and the hit's distance (K,) [m] from the segment's start.
+    """First hits of K rays.
+
+    Range (K,) [m] (inf: none), segment (K,) (`NO_HIT`), cosine of the angle of incidence (K,), and
+    the hit's distance (K,) [m] from the segment's start.
     """
 
     range_m: FloatArray
@@ -159,7 +162,7 @@ class WorldBuilder:
         if surface not in self._surfaces:
             self._surfaces.append(surface)
         index = self._surfaces.index(surface)
-        for start, end in zip(points[:-1], points[1:], strict=True):
+        for start, end in itertools.pairwise(points):
             self._segments.append(np.concatenate([start, end]))
             self._surface_of.append(index)
 
