@@ -101,8 +101,7 @@ class NavigationFilter:
         covariance: ArrayLike | None = None,
         T_base_sensor: SE2 = SE2(),
     ) -> None:
-        """Velocity (2,) [m/s], forward and left along the instrument's axes, with covariance (2,
-        2).
+        """Velocity (2,) [m/s] along the instrument's axes (x forward, y left).
 
         A velocity that is not finite (no bottom lock) is counted and dropped; so is a covariance
         that is none.
@@ -133,9 +132,7 @@ class NavigationFilter:
         self._add(stamp_ns, Clone(), ())
 
     def pose_at(self, stamp_ns: int) -> tuple[SE2, FloatArray]:
-        """``T_odom_base`` and its covariance (3, 3) at a time, predicted from what was measured
-        until then.
-        """
+        """``T_odom_base`` and covariance (3, 3), predicted from what was measured until then."""
         state, covariance = self._at(stamp_ns)
         return SE2.from_array(state[:3]), covariance[:3, :3].copy()
 
@@ -148,7 +145,9 @@ class NavigationFilter:
     def velocity_at(self, stamp_ns: int) -> tuple[FloatArray, float]:
         """Body velocity (2,) [m/s] over ground and yaw rate [rad/s]."""
         state, _ = self._at(stamp_ns)
-        return state[3:5].copy(), float(state[5])
+        cos, sin = math.cos(state[2]), math.sin(state[2])
+        current = np.array([cos * state[9] + sin * state[10], -sin * state[9] + cos * state[10]])
+        return (1.0 + state[7]) * state[3:5] + current, float(state[5])
 
     def sensor_errors(self) -> dict[str, float]:
         """What the filter believes of its sensors now."""

@@ -1,7 +1,10 @@
 """Compiled steps of the navigation filter.
 
-State (14): x, y, yaw in odom; vx, vy body velocity over ground; yaw rate; gyro bias; velocity
-scale error; heading offset; current cx, cy in odom; clone of an earlier pose ax, ay, ayaw.
+State (14): x, y, yaw in odom; ux, uy body velocity as the sensor sees it; yaw rate; gyro bias;
+velocity scale error; heading offset; current cx, cy in odom; clone of an earlier pose ax, ay,
+ayaw. The velocity over ground is (1 + scale) u + current. Scale and current act on the motion and
+not on the measurement: so only positions can teach them, and no change of speed is mistaken for
+either.
 """
 
 from __future__ import annotations
@@ -16,8 +19,9 @@ NUM_STATES = 14
 
 @njit(cache=True, nogil=True)
 def predict(state, covariance, dt_s, noise):  # type: ignore[no-untyped-def]
-    """Motion over `dt_s`; `noise` (7,): walks of velocity, turn, bias; sigma and time of heading
-    offset, of current.
+    """Motion over `dt_s`; returns new arrays.
+
+    `noise` (7,): walks of velocity, turn, bias; sigma and time of heading offset, of current.
 
     Constant velocity and constant turn; offset and current are first-order Gauss-Markov. Returns
     new arrays.
@@ -25,9 +29,10 @@ def predict(state, covariance, dt_s, noise):  # type: ignore[no-untyped-def]
     x = state.copy()
     heading = state[2] + 0.5 * state[5] * dt_s
     cos, sin = np.cos(heading), np.sin(heading)
-    vx, vy = state[3], state[4]
-    x[0] += (cos * vx - sin * vy) * dt_s
-    x[1] += (sin * vx + cos * vy) * dt_s
+    scale = 1.0 + state[7]
+    vx, vy = scale * state[3], scale * state[4]
+    x[0] += (cos * vx - sin * vy + state[9]) * dt_s
+    x[1] += (sin * vx + cos * vy + state[10]) * dt_s
     x[2] += state[5] * dt_s
     keep_offset = np.exp(-dt_s / noise[4])
     keep_current = np.exp(-dt_s / noise[6])
@@ -36,13 +41,12 @@ def predict(state, covariance, dt_s, noise):  # type: ignore[no-untyped-def]
     x[10] *= keep_current
     jac = np.eye(NUM_STATES)
     along, across = (-sin * vx - cos * vy) * dt_s, (cos * vx - sin * vy) * dt_s
-    jac[0, 2], jac[0, 3], jac[0, 4], jac[0, 5] = along, cos * dt_s, -sin * dt_s, 0.5 * along * dt_s
-    jac[1, 2], jac[1, 3], jac[1, 4], jac[1, 5] = (
-        across,
-        sin * dt_s,
-        cos * dt_s,
-        0.5 * across * dt_s,
-    )
+    for axis, turned, ahead, left in ((0, along, cos, -sin), (1, across, sin, cos)):
+        jac[axis, 2] = turned
+        jac[axis, 3], jac[axis, 4] = scale * ahead * dt_s, scale * left * dt_s
+        jac[axis, 5] = 0.5 * turned * dt_s
+        jac[axis, 7] = (ahead * state[3] + left * state[4]) * dt_s
+        jac[axis, 9 + axis] = dt_s
     jac[2, 5] = dt_s
     jac[8, 8] = keep_offset
     jac[9, 9] = keep_current
@@ -75,8 +79,9 @@ def predict(state, covariance, dt_s, noise):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def gated_update(state, covariance, innovation, jac, noise, gate):  # type: ignore[no-untyped-def]
-    """Kalman update (Joseph form) unless the squared Mahalanobis distance exceeds `gate`
-    (negative: no gate).
+    """Kalman update (Joseph form) unless the squared Mahalanobis distance exceeds `gate`.
+
+    A negative gate is none.
 
     Returns the new state, covariance and the squared distance; the old ones where the gate
     refused.

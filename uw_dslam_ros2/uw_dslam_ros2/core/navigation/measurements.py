@@ -57,22 +57,14 @@ class Velocity:
     T_base_sensor: SE2
 
     def model(self, state: FloatArray) -> Model:
-        """``z = (1 + scale) R_mount^T (v + rate x lever - R(yaw)^T current)``."""
-        lever_x, lever_y = self.T_base_sensor.x, self.T_base_sensor.y
-        cos, sin = math.cos(state[2]), math.sin(state[2])
-        cx, cy = float(state[9]), float(state[10])
-        current = np.array([cos * cx + sin * cy, -sin * cx + cos * cy])
-        body = np.array([state[3] - state[5] * lever_y, state[4] + state[5] * lever_x]) - current
+        """``z = R_mount^T (u + rate x lever)``."""
+        lever = np.array([-self.T_base_sensor.y, self.T_base_sensor.x])
         rotation = self.T_base_sensor.rotation().T
-        scale = 1.0 + float(state[7])
         jac = np.zeros((2, NUM_STATES))
-        jac[:, 2] = scale * rotation @ np.array([-current[1], current[0]])
-        jac[:, 3], jac[:, 4] = scale * rotation[:, 0], scale * rotation[:, 1]
-        jac[:, 5] = scale * rotation @ np.array([-lever_y, lever_x])
-        jac[:, 7] = rotation @ body
-        jac[:, 9] = -scale * rotation @ np.array([cos, -sin])
-        jac[:, 10] = -scale * rotation @ np.array([sin, cos])
-        return self.velocity_m_s - scale * rotation @ body, jac, self.noise
+        jac[:, 3:5] = rotation
+        jac[:, 5] = rotation @ lever
+        expected = rotation @ (state[3:5] + state[5] * lever)
+        return self.velocity_m_s - expected, jac, self.noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -212,10 +212,8 @@ def _threshold_ratio(
     exponent = 2 if config.intensity == "amplitude" else 1
     floor = (config.min_threshold * full_scale) ** exponent
     if config.segmentation == "fixed":
-        threshold = max(
-            (config.fixed_threshold * full_scale) ** exponent, np.finfo(np.float32).tiny
-        )
-        return power / np.float32(threshold)
+        threshold = max((config.fixed_threshold * full_scale) ** exponent, 1e-30)
+        return np.asarray(power / np.float32(threshold), np.float32)
     if config.segmentation == "adaptive":
         return row_ratio(power, config.adaptive_factor, floor)
     num_train, rate = config.num_train_cells, config.false_alarm_rate

@@ -72,9 +72,7 @@ def cfar_ratio(power, num_train, num_guard, ca_factors, so_factor, floor):  # ty
 
 @njit(cache=True, nogil=True)
 def row_ratio(power, factor, floor):  # type: ignore[no-untyped-def]
-    """Power over mean + factor * deviation of its range, taken over all beams without their
-    outliers; (R, B).
-    """
+    """Power over mean + factor * deviation of its range, over all beams but outliers; (R, B)."""
     num_rows, num_beams = power.shape
     ratio = np.zeros((num_rows, num_beams), np.float32)
     for r in range(num_rows):

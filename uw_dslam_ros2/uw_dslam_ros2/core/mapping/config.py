@@ -1,0 +1,102 @@
+"""Settings of one vehicle's mapping."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.navigation.config import NavigationConfig
+from uw_dslam_ros2.core.sonar.config import SonarConfig
+
+__all__ = ["LoopConfig", "MatchConfig", "OccupancyConfig", "SubmapConfig", "VehicleMapperConfig"]
+
+
+@dataclass(frozen=True, slots=True)
+class OccupancyConfig(Config):
+    """The grid and the sonar's inverse sensor model."""
+
+    resolution_m: float = setting(0.05, 0.01, 10.0, "cell size; coarser where the sonar is")
+    hit_log_odds: float = setting(0.7, 0.01, 10.0, "evidence of a strong echo at its own cell")
+    free_log_odds: float = setting(
+        0.15, 0.001, 10.0, "evidence of free water before the first echo"
+    )
+    log_odds_max: float = setting(4.0, 0.5, 20.0, "a cell's evidence is cut there")
+    free_margin_m: float = setting(
+        0.15, 0.0, 10.0, "water this close before an echo stays unknown"
+    )
+    free_range_max_m: float = setting(30.0, 0.1, 1e4, "no free water is seen farther away")
+    max_spread_m: float = setting(0.5, 0.01, 10.0, "largest half width of an echo across the beam")
+    min_motion_m: float = setting(0.1, 0.0, 10.0, "a ping enters the map after this way ...")
+    min_turn_rad: float = setting(0.02, 0.0, 3.2, "... or this turn ...")
+    min_interval_s: float = setting(1.0, 0.0, 1e4, "... or this time, whichever comes first")
+
+
+@dataclass(frozen=True, slots=True)
+class SubmapConfig(Config):
+    """When a submap closes: whichever comes first."""
+
+    max_length_m: float = setting(25.0, 0.5, 1e4, "way travelled")
+    max_duration_s: float = setting(120.0, 1.0, 1e5, "time since its first ping")
+    max_sigma_m: float = setting(0.5, 0.01, 1e3, "uncertainty of the position within the submap")
+    min_pings: int = setting(3, 1, 10000, "no submap closes with fewer pings (but the last)")
+
+
+@dataclass(frozen=True, slots=True)
+class MatchConfig(Config):
+    """Scan-to-submap matching."""
+
+    sigma_m: float = setting(0.12, 0.01, 10.0, "width of the likelihood field: noise of an echo")
+    key_distance_m: float = setting(0.5, 0.0, 100.0, "a ping is matched after this way ...")
+    key_turn_rad: float = setting(0.1, 0.0, 3.2, "... or this turn ...")
+    key_interval_s: float = setting(5.0, 0.0, 1e4, "... or this time")
+    window_m: float = setting(2.0, 0.05, 100.0, "search at most this far from dead reckoning")
+    window_rad: float = setting(0.15, 0.001, 3.2, "search at most this far from its yaw")
+    local_length_m: float = setting(15.0, 0.1, 1e4, "way whose echoes a ping is matched against")
+    min_points: int = setting(20, 3, 100000, "fewer echoes are not matched")
+    min_overlap: float = setting(0.3, 0.0, 1.0, "share of the echoes that must meet known ones")
+    information_share: float = setting(
+        0.1, 0.001, 1.0, "independent information per echo: neighbouring echoes err together"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LoopConfig(Config):
+    """Loop closures between a vehicle's own submaps, and its pose graph."""
+
+    is_enabled: bool = setting(True, doc="close loops inside the vehicle")
+    max_candidates: int = setting(6, 0, 1000, "earlier submaps tried for each new one")
+    search_sigma: float = setting(
+        3.0, 0.5, 10.0, "search window in standard deviations of the graph"
+    )
+    max_window_m: float = setting(15.0, 0.1, 1e3, "largest half width of the search window")
+    max_window_rad: float = setting(
+        0.35, 0.01, 3.2, "largest half width of the search window in yaw"
+    )
+    min_overlap: float = setting(
+        0.45, 0.0, 1.0, "share of the points that must meet the other map"
+    )
+    min_lead: float = setting(
+        0.05, 0.0, 1.0, "lead over the best other pose, as a share of the score"
+    )
+    min_points: int = setting(60, 3, 100000, "submaps with fewer points are not matched")
+    max_points: int = setting(600, 10, 100000, "points of a submap that are matched")
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleMapperConfig(Config):
+    """Everything that one vehicle's mapping needs to know."""
+
+    estimator: str = setting(
+        "scan_matching",
+        choices=("dead_reckoning", "scan_matching"),
+        doc="who places the pings: dead reckoning alone, or scan matching and loop closures",
+    )
+    sonar: SonarConfig = setting(SonarConfig())
+    navigation: NavigationConfig = setting(NavigationConfig())
+    occupancy: OccupancyConfig = setting(OccupancyConfig())
+    submap: SubmapConfig = setting(SubmapConfig())
+    match: MatchConfig = setting(MatchConfig())
+    loop: LoopConfig = setting(LoopConfig())
+    max_wait_s: float = setting(
+        0.5, 0.0, 60.0, "a ping waits this long for its navigation messages"
+    )

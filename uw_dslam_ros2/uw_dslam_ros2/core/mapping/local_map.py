@@ -1,0 +1,72 @@
+"""The echoes of the last stretch of way, against which the next ping is matched."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.mapping.config import MatchConfig
+from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Match, Prior, match_points, thin
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["LocalMap"]
+
+FloatArray = NDArray[np.float64]
+_COARSEST = 8.0
+
+
+class LocalMap:
+    """Recent key pings in the open submap's frame."""
+
+    def __init__(self, config: MatchConfig) -> None:
+        self._config = config
+        self._pings: deque[tuple[FloatArray, FloatArray, float]] = deque()
+        self._way_m = 0.0
+        self._last: SE2 | None = None
+
+    def add(self, points: FloatArray, weight: FloatArray, T_submap_base: SE2) -> None:
+        """Add a key ping's echoes (N, 2) in the submap's frame; forget those too far back."""
+        if self._last is not None:
+            self._way_m += self._last.distance_to(T_submap_base)[0]
+        self._last = T_submap_base
+        self._pings.append((points, weight, self._way_m))
+        while self._way_m - self._pings[0][2] > self._config.local_length_m:
+            self._pings.popleft()
+
+    def rebase(self, T_new_old: SE2) -> None:
+        """Move everything to a new submap's frame."""
+        self._pings = deque((T_new_old.apply(p), w, way) for p, w, way in self._pings)
+        if self._last is not None:
+            self._last = T_new_old @ self._last
+
+    def match(self, points: FloatArray, weight: FloatArray, prior: Prior) -> Match | None:
+        """Match a ping's echoes (N, 2) in base_link; None where there is too little to match."""
+        config = self._config
+        if len(points) < config.min_points or not self._pings:
+            return None
+        known = np.vstack([p for p, _, _ in self._pings])
+        support = np.concatenate([w for _, w, _ in self._pings])
+        if len(known) < config.min_points:
+            return None
+        sigma = np.sqrt(np.diag(prior.covariance))
+        half_width = (
+            float(np.clip(3.0 * sigma[0], config.sigma_m, config.window_m)),
+            float(np.clip(3.0 * sigma[1], config.sigma_m, config.window_m)),
+            float(np.clip(3.0 * sigma[2], 0.2 * config.window_rad, config.window_rad)),
+        )
+        coarse = min(max(max(half_width[:2]) / 4.0, config.sigma_m), _COARSEST * config.sigma_m)
+        sigmas = [coarse]
+        while sigmas[-1] > 1.5 * config.sigma_m:
+            sigmas.append(max(0.5 * sigmas[-1], config.sigma_m))
+        fields = [LikelihoodField(known, support, s) for s in sigmas]
+        source, source_weight = thin(points, weight, config.sigma_m)
+        return match_points(
+            fields,
+            source,
+            np.minimum(source_weight, 1.0),
+            prior,
+            half_width,
+            config.information_share,
+        )

@@ -1,0 +1,86 @@
+"""Compiled loops of scan matching."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = ["score_poses", "score_window", "splat"]
+
+
+@njit(cache=True, nogil=True)
+def splat(field, points, weight, origin_x, origin_y, cell, sigma):  # type: ignore[no-untyped-def]
+    """Add ``weight * exp(-d^2 / (2 sigma^2))`` of every point (N, 2) within 3.5 sigma."""
+    num_rows, num_cols = field.shape
+    reach = 3.5 * sigma
+    for i in range(points.shape[0]):
+        px, py = points[i, 0] - origin_x, points[i, 1] - origin_y
+        c0, c1 = (
+            max(0, int(np.floor((px - reach) / cell))),
+            min(num_cols - 1, int(np.floor((px + reach) / cell))),
+        )
+        r0, r1 = (
+            max(0, int(np.floor((py - reach) / cell))),
+            min(num_rows - 1, int(np.floor((py + reach) / cell))),
+        )
+        for row in range(r0, r1 + 1):
+            dy = (row + 0.5) * cell - py
+            for col in range(c0, c1 + 1):
+                dx = (col + 0.5) * cell - px
+                field[row, col] += weight[i] * np.exp(-0.5 * (dx * dx + dy * dy) / (sigma * sigma))
+
+
+@njit(cache=True, nogil=True)
+def _value(field, u, v):  # type: ignore[no-untyped-def]
+    """Bilinear value at column `u`, row `v`, counted from the centre of cell (0, 0); 0 outside."""
+    col, row = int(np.floor(u)), int(np.floor(v))
+    if row < 0 or col < 0 or row + 1 >= field.shape[0] or col + 1 >= field.shape[1]:
+        return 0.0
+    a, b = u - col, v - row
+    return (1.0 - b) * ((1.0 - a) * field[row, col] + a * field[row, col + 1]) + b * (
+        (1.0 - a) * field[row + 1, col] + a * field[row + 1, col + 1]
+    )
+
+
+@njit(cache=True, nogil=True)
+def score_poses(field, origin_x, origin_y, cell, points, weight, poses):  # type: ignore[no-untyped-def]
+    """Sum of weighted field values under the points (N, 2), moved by each pose (K, 3); (K,)."""
+    scores = np.zeros(poses.shape[0])
+    for k in range(poses.shape[0]):
+        cos, sin = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        x0, y0 = poses[k, 0] - origin_x, poses[k, 1] - origin_y
+        total = 0.0
+        for i in range(points.shape[0]):
+            u = (x0 + cos * points[i, 0] - sin * points[i, 1]) / cell - 0.5
+            v = (y0 + sin * points[i, 0] + cos * points[i, 1]) / cell - 0.5
+            total += weight[i] * _value(field, u, v)
+        scores[k] = total
+    return scores
+
+
+@njit(cache=True, nogil=True)
+def score_window(  # type: ignore[no-untyped-def]
+    field, origin_x, origin_y, cell, points, weight, center, num_steps, step, yaw_step
+):  # fmt: skip
+    """Scores of a lattice of poses around `center` (3,): (yaw, y, x) of 2 * num_steps + 1 each.
+
+    `num_steps` (3,) counts x, y and yaw steps to each side; nearest cells, no interpolation.
+    """
+    num_rows, num_cols = field.shape
+    nx, ny, nt = num_steps[0], num_steps[1], num_steps[2]
+    scores = np.zeros((2 * nt + 1, 2 * ny + 1, 2 * nx + 1))
+    for t in range(2 * nt + 1):
+        yaw = center[2] + (t - nt) * yaw_step
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        for i in range(points.shape[0]):
+            px = center[0] - origin_x + cos * points[i, 0] - sin * points[i, 1] - nx * step
+            py = center[1] - origin_y + sin * points[i, 0] + cos * points[i, 1] - ny * step
+            for m in range(2 * ny + 1):
+                row = int(np.floor((py + m * step) / cell))
+                if row < 0 or row >= num_rows:
+                    continue
+                for n in range(2 * nx + 1):
+                    col = int(np.floor((px + n * step) / cell))
+                    if 0 <= col < num_cols:
+                        scores[t, m, n] += weight[i] * field[row, col]
+    return scores

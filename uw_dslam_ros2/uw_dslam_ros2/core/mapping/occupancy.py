@@ -1,0 +1,216 @@
+"""Occupancy grids that grow as pings come in."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.mapping.config import OccupancyConfig
+from uw_dslam_ros2.core.mapping.grid_kernels import (
+    NUM_DIRECTIONS,
+    add_ping,
+    beam_table,
+    resample_add,
+)
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar.types import Detections
+
+__all__ = ["UNITS_PER_NAT", "GrowingGrid", "PackedEvidence", "SparseEvidence", "fuse"]
+
+UNITS_PER_NAT = 1000.0
+"""Evidence is counted in integers of a thousandth of a nat, so that sums are exact in any
+order."""
+
+_TILE = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SparseEvidence:
+    """A closed grid: integer evidence (R, C) and mask.
+
+    Its cell (0, 0) lies at lattice cell `row`, `col`.
+    """
+
+    evidence: NDArray[np.int32]
+    observed: NDArray[np.bool_]
+    row: int
+    col: int
+    resolution_m: float
+
+    def corners(self) -> NDArray[np.float64]:
+        """Outer corners (4, 2) [m]."""
+        num_rows, num_cols = self.evidence.shape
+        cells = [
+            (self.col + i * num_cols, self.row + j * num_rows) for i in (0, 1) for j in (0, 1)
+        ]
+        return np.array(cells) * self.resolution_m
+
+    def to_occupancy(self, log_odds_max: float) -> OccupancyMap:
+        """Probability in percent."""
+        num_rows, num_cols = self.evidence.shape
+        spec = GridSpec(
+            self.resolution_m,
+            num_rows,
+            num_cols,
+            SE2(self.col * self.resolution_m, self.row * self.resolution_m, 0.0),
+        )
+        limit = int(log_odds_max * UNITS_PER_NAT)
+        # A table instead of millions of exponentials.
+        percent = 100.0 / (1.0 + np.exp(-np.arange(-limit, limit + 1) / UNITS_PER_NAT))
+        table = np.rint(percent).astype(np.int8)
+        values = table[np.clip(self.evidence, -limit, limit) + limit]
+        return OccupancyMap(spec, np.where(self.observed, values, np.int8(UNKNOWN)))
+
+    def packed(self) -> PackedEvidence:
+        """Compressed for keeping; evidence is cut at 32 nats."""
+        evidence = np.clip(self.evidence, -32767, 32767).astype(np.int16)
+        evidence[~self.observed] = -32768
+        return PackedEvidence(
+            zlib.compress(evidence.tobytes(), 1),
+            self.evidence.shape,
+            self.row,
+            self.col,
+            self.resolution_m,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedEvidence:
+    """`SparseEvidence` at a twentieth of its size."""
+
+    data: bytes
+    shape: tuple[int, int]
+    row: int
+    col: int
+    resolution_m: float
+
+    def unpacked(self) -> SparseEvidence:
+        """The grid again."""
+        evidence = np.frombuffer(zlib.decompress(self.data), np.int16).reshape(self.shape)
+        observed = evidence != -32768
+        return SparseEvidence(
+            np.where(observed, evidence, 0).astype(np.int32),
+            observed,
+            self.row,
+            self.col,
+            self.resolution_m,
+        )
+
+
+class GrowingGrid:
+    """Evidence on a lattice through the frame's zero.
+
+    It grows by whole tiles, so cells never move by fractions.
+    """
+
+    def __init__(self, config: OccupancyConfig = OccupancyConfig()) -> None:  # noqa: B008 (frozen)
+        self._config = config
+        self._row, self._col = 0, 0
+        self._evidence = np.zeros((0, 0), np.int32)
+        self._observed = np.zeros((0, 0), np.bool_)
+        self.num_pings = 0
+
+    def add(self, detections: Detections, T_frame_sonar: SE2) -> None:
+        """Add one ping, seen from ``T_frame_sonar``."""
+        config = self._config
+        free_range = np.minimum(
+            detections.free_range_m - config.free_margin_m, config.free_range_max_m
+        )
+        free_range = np.maximum(free_range, 0.0)
+        self._grow_for(detections, T_frame_sonar, float(free_range.max(initial=0.0)))
+        beams = beam_table(detections.bearing_rad, 0.75 * detections.beamwidth_rad, NUM_DIRECTIONS)
+        add_ping(
+            self._evidence, self._observed, self._row, self._col, config.resolution_m,
+            T_frame_sonar.x, T_frame_sonar.y, T_frame_sonar.yaw,
+            detections.points, detections.weight,
+            detections.range_sigma_m, detections.beamwidth_rad, config.max_spread_m,
+            beams, free_range,
+            config.hit_log_odds * UNITS_PER_NAT, round(config.free_log_odds * UNITS_PER_NAT),
+        )  # fmt: skip
+        self.num_pings += 1
+
+    def trimmed(self) -> SparseEvidence:
+        """The observed part, at least one cell."""
+        resolution = self._config.resolution_m
+        rows, cols = (
+            np.flatnonzero(self._observed.any(axis=1)),
+            np.flatnonzero(self._observed.any(axis=0)),
+        )
+        if len(rows) == 0:
+            return SparseEvidence(
+                np.zeros((1, 1), np.int32), np.zeros((1, 1), np.bool_), 0, 0, resolution
+            )
+        window = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
+        return SparseEvidence(
+            self._evidence[window].copy(),
+            self._observed[window].copy(),
+            self._row + int(rows[0]),
+            self._col + int(cols[0]),
+            resolution,
+        )
+
+    def _grow_for(self, detections: Detections, T_frame_sonar: SE2, reach_m: float) -> None:
+        config = self._config
+        points = T_frame_sonar.apply(detections.points)
+        margin = 2.0 * (config.max_spread_m + detections.range_sigma_m) + config.resolution_m
+        here = np.array([[T_frame_sonar.x, T_frame_sonar.y]])
+        low = np.vstack([points - margin, here - reach_m]).min(axis=0)
+        high = np.vstack([points + margin, here + reach_m]).max(axis=0)
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise InvalidInputError(
+                "a ping reaches to infinity, expected finite points and ranges"
+            )
+        first = np.floor(low / config.resolution_m).astype(np.int64)[::-1]
+        last = np.floor(high / config.resolution_m).astype(np.int64)[::-1]
+        num_rows, num_cols = self._evidence.shape
+        if self._evidence.size:
+            old_last = (self._row + num_rows - 1, self._col + num_cols - 1)
+            first = np.minimum(first, (self._row, self._col))
+            last = np.maximum(last, old_last)
+        row, col = (math.floor(v / _TILE) * _TILE for v in first)
+        rows, cols = (
+            math.ceil((v + 1) / _TILE) * _TILE - start
+            for v, start in zip(last, (row, col), strict=True)
+        )
+        if (row, col, rows, cols) == (self._row, self._col, num_rows, num_cols):
+            return
+        evidence, observed = np.zeros((rows, cols), np.int32), np.zeros((rows, cols), np.bool_)
+        if self._evidence.size:
+            window = (
+                slice(self._row - row, self._row - row + num_rows),
+                slice(self._col - col, self._col - col + num_cols),
+            )
+            evidence[window], observed[window] = self._evidence, self._observed
+        self._row, self._col, self._evidence, self._observed = row, col, evidence, observed
+
+
+def fuse(parts: Iterable[tuple[SparseEvidence, SE2]], log_odds_max: float) -> OccupancyMap:
+    """One map of several grids at their poses; evidence is summed, order does not matter."""
+    items = list(parts)
+    if not items:
+        raise InvalidInputError("there is no grid to fuse, expected at least one")
+    resolution = items[0][0].resolution_m
+    corners = np.vstack([pose.apply(part.corners()) for part, pose in items])
+    col, row = np.floor(corners.min(axis=0) / resolution).astype(np.int64)
+    cols, rows = np.ceil(corners.max(axis=0) / resolution).astype(np.int64) - (col, row)
+    evidence, observed = np.zeros((rows, cols), np.int32), np.zeros((rows, cols), np.bool_)
+    for part, pose in items:
+        if part.resolution_m != resolution:
+            raise InvalidInputError(
+                f"resolution is {part.resolution_m} m, expected {resolution} m"
+            )
+        resample_add(
+            evidence, observed, int(row), int(col),
+            part.evidence, part.observed, part.row, part.col,
+            pose.x, pose.y, pose.yaw, resolution,
+        )  # fmt: skip
+    return SparseEvidence(evidence, observed, int(row), int(col), resolution).to_occupancy(
+        log_odds_max
+    )

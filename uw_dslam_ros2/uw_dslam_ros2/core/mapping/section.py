@@ -1,0 +1,149 @@
+"""The submap that is being built, and what stays of closed ones."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.mapping.config import SubmapConfig, VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, thin
+from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid, PackedEvidence
+from uw_dslam_ros2.core.mapping.submap import Submap
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar.types import Detections
+
+__all__ = ["ClosedSection", "OpenSection"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(slots=True, eq=False)
+class ClosedSection:
+    """A closed submap: rigid from now on; only its pose and revision change."""
+
+    sequence: int
+    stamp_ns: int
+    evidence: PackedEvidence
+    points: FloatArray
+    weight: FloatArray
+    trajectory: FloatArray
+    stamps_ns: NDArray[np.int64]
+    covariance: FloatArray
+    T_odom_issued: SE2
+    revision: int = 0
+    fields: dict[float, LikelihoodField] | None = None
+
+    @property
+    def center(self) -> FloatArray:
+        """Mean of its points (2,) in its own frame; the zero where there are none."""
+        return self.points.mean(axis=0) if len(self.points) else np.zeros(2)
+
+    @property
+    def radius_m(self) -> float:
+        """Distance from the centre within which nine of ten points lie."""
+        if len(self.points) == 0:
+            return 0.0
+        return float(np.quantile(np.linalg.norm(self.points - self.center, axis=1), 0.9))
+
+    def to_submap(self, vehicle_id: str, T_odom_submap: SE2, log_odds_max: float) -> Submap:
+        """What the vehicle gives away."""
+        return Submap(
+            vehicle_id,
+            self.sequence,
+            self.revision,
+            True,
+            self.stamp_ns,
+            T_odom_submap,
+            self.covariance,
+            self.evidence.unpacked().to_occupancy(log_odds_max),
+            self.points,
+            self.trajectory,
+            self.stamps_ns,
+        )
+
+
+class OpenSection:
+    """Pings of one submap in its own frame, base_link's pose at its start."""
+
+    def __init__(self, config: VehicleMapperConfig, sequence: int, covariance: FloatArray) -> None:
+        self._config = config
+        self.sequence = sequence
+        self._covariance = covariance
+        self.grid = GrowingGrid(config.occupancy)
+        self._points: list[FloatArray] = []
+        self._weight: list[FloatArray] = []
+        self._trajectory: list[tuple[float, float, float]] = []
+        self._stamps_ns: list[int] = []
+        self._length_m = 0.0
+        self._last_mapped: tuple[int, SE2] | None = None
+        self.num_pings = 0
+
+    @property
+    def poses(self) -> FloatArray:
+        """``T_submap_base`` of each ping (K, 3)."""
+        return np.array(self._trajectory).reshape(-1, 3)
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Time of each ping (K,)."""
+        return np.array(self._stamps_ns, dtype=np.int64)
+
+    def add(self, detections: Detections, T_submap_base: SE2, T_base_sonar: SE2) -> None:
+        """Add one ping; it enters the grid only after some way, turn or time since the last."""
+        stamp_ns = detections.stamp_ns
+        if self._trajectory:
+            x, y, _ = self._trajectory[-1]
+            self._length_m += math.hypot(T_submap_base.x - x, T_submap_base.y - y)
+        self._trajectory.append((T_submap_base.x, T_submap_base.y, T_submap_base.yaw))
+        self._stamps_ns.append(stamp_ns)
+        self.num_pings += 1
+        if self._is_due(stamp_ns, T_submap_base):
+            self._last_mapped = (stamp_ns, T_submap_base)
+            T_submap_sonar = T_submap_base @ T_base_sonar
+            self.grid.add(detections, T_submap_sonar)
+            if len(detections.points):
+                self._points.append(T_submap_sonar.apply(detections.points))
+                self._weight.append(detections.weight)
+
+    def should_close(self, stamp_ns: int, sigma_m: float) -> bool:
+        """Whether way, time or uncertainty says so."""
+        config: SubmapConfig = self._config.submap
+        if self.num_pings < config.min_pings:
+            return False
+        return (
+            self._length_m >= config.max_length_m
+            or (stamp_ns - self._stamps_ns[0]) * 1e-9 >= config.max_duration_s
+            or sigma_m >= config.max_sigma_m
+        )
+
+    def close(self, T_odom_submap: SE2) -> ClosedSection:
+        """Freeze it."""
+        points = np.vstack(self._points) if self._points else np.empty((0, 2))
+        weight = np.concatenate(self._weight) if self._weight else np.empty(0)
+        points, weight = thin(points, weight, self._config.match.sigma_m)
+        return ClosedSection(
+            self.sequence,
+            self._stamps_ns[-1],
+            self.grid.trimmed().packed(),
+            points,
+            weight,
+            self.poses,
+            self.stamps_ns,
+            self._covariance,
+            T_odom_submap,
+        )
+
+    def _is_due(self, stamp_ns: int, T_submap_base: SE2) -> bool:
+        if self._last_mapped is None:
+            return True
+        config = self._config.occupancy
+        last_ns, last = self._last_mapped
+        distance, turn = last.distance_to(T_submap_base)
+        return (
+            distance >= config.min_motion_m
+            or turn >= config.min_turn_rad
+            or (stamp_ns - last_ns) * 1e-9 >= config.min_interval_s
+        )

@@ -1,0 +1,369 @@
+"""One vehicle's mapping: sensor messages in, submaps, map and trajectory out."""
+
+from __future__ import annotations
+
+import heapq
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.graph import SubmapGraph
+from uw_dslam_ros2.core.mapping.local_map import LocalMap
+from uw_dslam_ros2.core.mapping.loops import find_loops
+from uw_dslam_ros2.core.mapping.matcher import Prior
+from uw_dslam_ros2.core.mapping.occupancy import fuse
+from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
+from uw_dslam_ros2.core.mapping.submap import Submap
+from uw_dslam_ros2.core.navigation import NavigationFilter
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar import (
+    Detections,
+    SonarImage,
+    detect,
+    detections_from_points,
+    detections_from_scan,
+)
+
+__all__ = ["VehicleMapper"]
+
+FloatArray = NDArray[np.float64]
+_REISSUE_M, _REISSUE_RAD = 0.02, 0.002
+
+
+class VehicleMapper:
+    """Maps one vehicle's surroundings; every input is a method call with a stamp in nanoseconds.
+
+    A ping waits until navigation has caught up with it (at most `VehicleMapperConfig.max_wait_s`
+    of sonar time), so the order in which messages arrive does not matter within that time. The
+    odom frame begins where the vehicle does.
+    """
+
+    def __init__(self, config: VehicleMapperConfig, vehicle_id: str) -> None:
+        if not vehicle_id:
+            raise InvalidInputError("vehicle_id is empty, expected a name")
+        self._config = config
+        self._vehicle_id = vehicle_id
+        self._navigation = NavigationFilter(config.navigation)
+        self._graph = SubmapGraph()
+        self._local_map = LocalMap(config.match)
+        self._closed: list[ClosedSection] = []
+        self._open: OpenSection | None = None
+        self._pending: list[tuple[int, int, Detections, SE2]] = []
+        self._num_queued = 0
+        self._last_ping_ns: int | None = None
+        self._last_key: tuple[int, SE2] | None = None
+        self._counts: dict[str, float | int | str] = {
+            "num_pings": 0, "num_pings_dropped": 0, "num_key_pings": 0, "num_matches": 0,
+            "num_detections_last": 0, "match_overlap_last": math.nan, "depth_m": math.nan,
+        }  # fmt: skip
+        self._velocity_ns: int | None = None
+
+    # --- navigation in
+    # -------------------------------------------------------------------------------------------
+
+    def add_imu(
+        self,
+        stamp_ns: int,
+        yaw_rad: float | None,
+        yaw_rate_rad_s: float | None,
+        yaw_sigma_rad: float | None = None,
+    ) -> list[Submap]:
+        """Yaw and yaw rate of base_link, counter-clockwise; None where not measured.
+
+        Yaw may have an unknown constant offset.
+        """
+        if yaw_rate_rad_s is not None:
+            self._navigation.add_yaw_rate(stamp_ns, yaw_rate_rad_s)
+        if yaw_rad is not None:
+            self._navigation.add_yaw(stamp_ns, yaw_rad, yaw_sigma_rad)
+        return self._process_ready()
+
+    def add_velocity(
+        self,
+        stamp_ns: int,
+        v_body_m_s: ArrayLike,
+        covariance: ArrayLike | None = None,
+        T_base_sensor: SE2 = SE2(),
+    ) -> list[Submap]:
+        """Velocity (2,) along the instrument's axes (forward, left) with covariance (2, 2)."""
+        self._navigation.add_velocity(stamp_ns, v_body_m_s, covariance, T_base_sensor)
+        if np.isfinite(np.asarray(v_body_m_s, dtype=np.float64)).all():
+            self._velocity_ns = max(stamp_ns, self._velocity_ns or stamp_ns)
+        return self._process_ready()
+
+    def add_depth(self, stamp_ns: int, depth_m: float) -> None:  # noqa: ARG002 (one form for all inputs)
+        """Depth below the surface [m], positive down.
+
+        Kept for the diagnostics: the map is flat.
+        """
+        if math.isfinite(depth_m):
+            self._counts["depth_m"] = float(depth_m)
+
+    # --- sonar in
+    # ----------------
+
+    def add_image(self, image: SonarImage, T_base_sonar: SE2) -> list[Submap]:
+        """A sonar image; returns submaps that closed, or whose pose has moved, by now."""
+        return self._add(detect(image, self._config.sonar), T_base_sonar)
+
+    def add_scan(
+        self,
+        stamp_ns: int,
+        angles_rad: ArrayLike,
+        ranges_m: ArrayLike,
+        range_max_m: float,
+        T_base_sonar: SE2,
+    ) -> list[Submap]:
+        """A scan: angles (B,), ranges (B,), infinity where a beam met nothing."""
+        found = detections_from_scan(
+            stamp_ns, angles_rad, ranges_m, range_max_m, self._config.sonar
+        )
+        return self._add(found, T_base_sonar)
+
+    def add_points(self, stamp_ns: int, points: ArrayLike, T_base_sonar: SE2) -> list[Submap]:
+        """Detections (N, 2) [m] that somebody else made, in the sonar's frame."""
+        return self._add(
+            detections_from_points(stamp_ns, points, self._config.sonar), T_base_sonar
+        )
+
+    def finish(self) -> list[Submap]:
+        """Work off what waits, close the open submap, and settle the graph; no ping may follow."""
+        self._navigation.start()
+        issued = self._process_ready(flush=True)
+        if self._open is not None:
+            issued += self._close()
+            self._open = None
+        newest: dict[int, Submap] = {submap.sequence: submap for submap in issued}
+        return [newest[sequence] for sequence in sorted(newest)]
+
+    # --- results
+    # ----------------
+
+    @property
+    def is_started(self) -> bool:
+        """Whether there is a pose."""
+        return self._navigation.is_started
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Time of `T_odom_base`: of the newest navigation message; None before the first."""
+        return self._navigation.stamp_ns
+
+    @property
+    def T_odom_base(self) -> SE2:  # noqa: N802 (a motion)
+        """Where the vehicle is now.
+
+        Raises `InvalidInputError` before the first navigation message.
+        """
+        stamp_ns = self._navigation.stamp_ns
+        if stamp_ns is None:
+            raise InvalidInputError("there is no pose yet, expected navigation messages first")
+        if self._open is None:
+            if self._closed:
+                last = self._closed[-1]
+                return self._graph.poses[-1] @ SE2.from_array(last.trajectory[-1])
+            return self._navigation.pose_at(stamp_ns)[0]
+        return self._graph.poses[-1] @ self._navigation.relative_at(stamp_ns)[0]
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """Covariance (3, 3) of `T_odom_base`, order x, y, yaw, in odom."""
+        stamp_ns = self._navigation.stamp_ns
+        if stamp_ns is None:
+            raise InvalidInputError("there is no pose yet, expected navigation messages first")
+        return self._navigation.pose_at(stamp_ns)[1]
+
+    @property
+    def velocity(self) -> tuple[FloatArray, float]:
+        """Body velocity (2,) [m/s] over ground and yaw rate [rad/s] now."""
+        stamp_ns = self._navigation.stamp_ns
+        if stamp_ns is None:
+            raise InvalidInputError("there is no velocity yet, expected navigation messages first")
+        return self._navigation.velocity_at(stamp_ns)
+
+    def trajectory(self) -> tuple[NDArray[np.int64], FloatArray]:
+        """Stamps (K,) and poses (K, 3) of base_link in odom at every ping, as best known now."""
+        parts = [(s.stamps_ns, s.trajectory) for s in self._closed]
+        if self._open is not None:
+            parts.append((self._open.stamps_ns, self._open.poses))
+        stamps = [np.empty(0, np.int64)]
+        poses = [np.empty((0, 3))]
+        for T_odom_submap, (part_stamps, part) in zip(self._graph.poses, parts, strict=False):
+            moved = np.column_stack(
+                [T_odom_submap.apply(part[:, :2]), part[:, 2] + T_odom_submap.yaw]
+            )
+            moved[:, 2] = np.mod(moved[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+            stamps.append(part_stamps)
+            poses.append(moved)
+        return np.concatenate(stamps), np.vstack(poses)
+
+    def vehicle_map(self) -> OccupancyMap:
+        """All submaps, the open one included, in odom.
+
+        Raises `InvalidInputError` before the first ping.
+        """
+        parts = [section.evidence.unpacked() for section in self._closed]
+        if self._open is not None:
+            parts.append(self._open.grid.trimmed())
+        if not parts:
+            raise InvalidInputError("there is no map yet, expected a ping with navigation first")
+        poses = self._graph.poses
+        return fuse(zip(parts, poses, strict=True), self._config.occupancy.log_odds_max)
+
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """Counters and the filter's beliefs, by name."""
+        navigation = self._navigation
+        newest_ns = navigation.stamp_ns
+        age_s = math.nan
+        if newest_ns is not None and self._velocity_ns is not None:
+            age_s = (newest_ns - self._velocity_ns) * 1e-9
+        return {
+            "vehicle_id": self._vehicle_id,
+            "estimator": self._config.estimator,
+            **self._counts,
+            "num_pings_waiting": len(self._pending),
+            "num_submaps": len(self._closed),
+            "num_loops": len(self._graph.loops),
+            "num_loops_believed": int((self._graph.loop_weights > 0.5).sum()),
+            "velocity_age_s": age_s,
+            "num_navigation_late": navigation.num_late,
+            "num_navigation_invalid": navigation.num_invalid,
+            "num_navigation_outliers": navigation.num_outliers,
+            **navigation.sensor_errors(),
+        }
+
+    # --- inside
+    # ----------------
+
+    def _add(self, detections: Detections, T_base_sonar: SE2) -> list[Submap]:
+        heapq.heappush(
+            self._pending, (detections.stamp_ns, self._num_queued, detections, T_base_sonar)
+        )
+        self._num_queued += 1
+        return self._process_ready()
+
+    def _process_ready(self, flush: bool = False) -> list[Submap]:
+        issued: list[Submap] = []
+        while self._pending:
+            stamp_ns, _, detections, T_base_sonar = self._pending[0]
+            newest_ns = max(item[0] for item in self._pending)
+            navigation_ns = self._navigation.stamp_ns
+            is_ready = navigation_ns is not None and navigation_ns >= stamp_ns
+            has_waited = newest_ns - stamp_ns > self._config.max_wait_s * 1e9
+            if not (is_ready or has_waited or flush):
+                break
+            heapq.heappop(self._pending)
+            is_old = self._last_ping_ns is not None and stamp_ns <= self._last_ping_ns
+            if navigation_ns is None or is_old:
+                self._count("num_pings_dropped")
+                continue
+            self._last_ping_ns = stamp_ns
+            issued += self._process(detections, T_base_sonar)
+        return issued
+
+    def _count(self, name: str) -> None:
+        self._counts[name] = int(self._counts[name]) + 1
+
+    def _process(self, detections: Detections, T_base_sonar: SE2) -> list[Submap]:
+        issued: list[Submap] = []
+        stamp_ns = detections.stamp_ns
+        self._count("num_pings")
+        self._counts["num_detections_last"] = len(detections.points)
+        if self._open is None:
+            self._begin(stamp_ns)
+        assert self._open is not None
+        if self._is_key(stamp_ns):
+            self._match(detections, T_base_sonar)
+        T_submap_base, covariance = self._navigation.relative_at(stamp_ns)
+        sigma_m = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+        if self._open.should_close(stamp_ns, sigma_m):
+            issued = self._close()
+            self._begin(stamp_ns, T_submap_base, covariance)
+            T_submap_base = SE2()
+        self._open.add(detections, T_submap_base, T_base_sonar)
+        return issued
+
+    def _begin(
+        self,
+        stamp_ns: int,
+        T_previous_new: SE2 | None = None,
+        covariance: FloatArray | None = None,
+    ) -> None:
+        """Open a submap at the vehicle's pose of now."""
+        T_odom_base, odom_covariance = self._navigation.pose_at(stamp_ns)
+        index = len(self._closed)
+        if T_previous_new is None or covariance is None:
+            covariance = odom_covariance
+            self._graph.add_first(T_odom_base)
+        else:
+            self._graph.add_next(T_previous_new, covariance)
+            self._local_map.rebase(T_previous_new.inverse())
+            if self._last_key is not None:
+                self._last_key = (self._last_key[0], T_previous_new.inverse() @ self._last_key[1])
+        self._open = OpenSection(self._config, index, covariance)
+        self._navigation.clone(stamp_ns)
+
+    def _is_key(self, stamp_ns: int) -> bool:
+        if self._config.estimator == "dead_reckoning":
+            return False
+        if self._last_key is None:
+            return True
+        config = self._config.match
+        last_ns, last = self._last_key
+        distance, turn = last.distance_to(self._navigation.relative_at(stamp_ns)[0])
+        return (
+            distance >= config.key_distance_m
+            or turn >= config.key_turn_rad
+            or (stamp_ns - last_ns) * 1e-9 >= config.key_interval_s
+        )
+
+    def _match(self, detections: Detections, T_base_sonar: SE2) -> None:
+        """Correct the pose of now by the echoes of this ping, then remember them."""
+        stamp_ns = detections.stamp_ns
+        points = T_base_sonar.apply(detections.points)
+        T_submap_base, covariance = self._navigation.relative_at(stamp_ns)
+        self._count("num_key_pings")
+        # A pose that is exactly known cannot be corrected; a millimetre keeps the algebra regular.
+        prior = Prior(T_submap_base, covariance + np.diag([1e-6, 1e-6, 1e-8]))
+        match = self._local_map.match(points, detections.weight, prior)
+        if match is not None:
+            self._counts["match_overlap_last"] = match.overlap
+            if match.overlap >= self._config.match.min_overlap:
+                self._count("num_matches")
+                self._navigation.add_fix(stamp_ns, match.T_target_source, match.information)
+                T_submap_base, _ = self._navigation.relative_at(stamp_ns)
+        if len(points):
+            self._local_map.add(T_submap_base.apply(points), detections.weight, T_submap_base)
+        self._last_key = (stamp_ns, T_submap_base)
+
+    def _close(self) -> list[Submap]:
+        """Close the open submap, look for loops, and say which submaps are new or have moved."""
+        assert self._open is not None
+        poses = self._graph.poses
+        section = self._open.close(poses[-1])
+        self._closed.append(section)
+        self._open = None
+        if self._config.estimator == "scan_matching" and self._config.loop.is_enabled:
+            find_loops(self._graph, self._closed, self._config)
+        return self._issue(new=section)
+
+    def _issue(self, new: ClosedSection | None = None) -> list[Submap]:
+        issued = []
+        for section, T_odom_submap in zip(self._closed, self._graph.poses, strict=False):
+            distance, turn = section.T_odom_issued.distance_to(T_odom_submap)
+            has_moved = distance > _REISSUE_M or turn > _REISSUE_RAD
+            if section is not new:
+                if not has_moved:
+                    continue
+                section.revision += 1
+            section.T_odom_issued = T_odom_submap
+            issued.append(
+                section.to_submap(
+                    self._vehicle_id, T_odom_submap, self._config.occupancy.log_odds_max
+                )
+            )
+        return issued
