@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import InvalidInputError
@@ -151,7 +151,10 @@ def _profile(
     whim = 1.0 + 0.1 * np.sin(2.0 * math.pi * s / rng.uniform(20.0, 50.0) + rng.uniform(0.0, 6.0))
     limit = config.max_yaw_rate_rad_s / np.maximum(turn, 1e-9)
     speeds = np.minimum(config.speed_m_s * whim, limit)
-    return s, headings, gaussian_filter1d(speeds, 1.0 / s[1], mode="nearest")
+    # It brakes before the bend: the smooth speed never exceeds the limit.
+    window = math.ceil(0.5 / s[1])
+    speeds = minimum_filter1d(speeds, 4 * window + 1, mode="nearest")
+    return s, headings, gaussian_filter1d(speeds, window, truncate=2.0, mode="nearest")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
