@@ -102,7 +102,7 @@ class LikelihoodField:
         points: FloatArray,
         weight: FloatArray,
         center: FloatArray,
-        num_steps: FloatArray,
+        num_steps: NDArray[np.int64],
         step: float,
         yaw_step: float,
     ) -> FloatArray:
