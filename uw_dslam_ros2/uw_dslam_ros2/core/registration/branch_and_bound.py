@@ -199,15 +199,12 @@ class Problem:
 
     @staticmethod
     def _extent(fields: Sequence[Field]) -> tuple[FloatArray, FloatArray]:
-        low: FloatArray = np.min([field.origin for field in fields], axis=0)
-        high: FloatArray = np.max(
-            [
-                field.origin + field.pitch_m * (np.array(field.coefficients.shape)[::-1] - 1)
-                for field in fields
-            ],
-            axis=0,
-        )
-        return low, high
+        lows = [field.origin for field in fields]
+        highs = [
+            field.origin + field.pitch_m * (np.array(field.coefficients.shape)[::-1] - 1)
+            for field in fields
+        ]
+        return np.array(lows).min(axis=0), np.array(highs).max(axis=0)
 
     def _window(self) -> FloatArray:
         """All (theta, x, y) at which a point can touch its field: centre, half widths (6,)."""

@@ -169,7 +169,7 @@ def likelihood_field(
     nodes_per_sigma: float = 4.0,
     max_nodes: int = 25_000_000,
 ) -> Field:
-    """Logarithm of a likelihood ratio, ``log(1 + c S(p)) / log(1 + c)`` with S the mixture's field.
+    """Log of a likelihood ratio, ``log(1 + c S(p)) / log(1 + c)`` with S the mixture's field.
 
     A source point either belongs to one of the targets or is uniform clutter; `contrast` is the
     ratio of the two densities on top of a target. The logarithm saturates, so many targets near
