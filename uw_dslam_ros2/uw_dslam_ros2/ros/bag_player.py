@@ -39,7 +39,6 @@ __all__ = ["BagPlayer", "BagPlayerConfig", "main"]
 _STATIC = "/tf_static"
 _OWN_TOPICS = ("/clock", "/rosout", "/parameter_events")
 _SETTLED_S = 1.0
-_ACKED_EVERY = 50
 _MAX_HOLD_S = 20.0
 
 
@@ -227,9 +226,6 @@ class BagPlayer(Node):
         publisher.publish(bytes(raw.data))
         self._lags.sent(vehicle, raw.stamp_ns)
         self._num_published += 1
-        if self._num_published % _ACKED_EVERY == 0:
-            # Before the writer's history wraps round, its readers must have taken what is in it.
-            publisher.wait_for_all_acked(Duration(seconds=1))
         return True
 
     def _advance_clock(self, stamp_ns: int) -> None:
@@ -283,7 +279,7 @@ class BagPlayer(Node):
             self._clock_pub.publish(ClockMsg(clock=stamp_to_msg(self._last_clock_ns)))
         for publisher in (*self._playing_pubs.values(), self._clock_pub):
             if not self._is_stopped():
-                publisher.wait_for_all_acked(Duration(seconds=2))
+                publisher.wait_for_all_acked(Duration(seconds=10))
 
 
 class _Lags:

@@ -21,7 +21,7 @@ TF = QoSProfile(depth=100)
 DEFAULT = QoSProfile(depth=10)
 CLOCK = QoSProfile(depth=10)
 
-PLAYBACK = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
+PLAYBACK = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 """What a bag player offers: reliable, so that large images arrive; best effort matches it too."""
 
 

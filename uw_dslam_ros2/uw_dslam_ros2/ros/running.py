@@ -3,43 +3,67 @@
 from __future__ import annotations
 
 import signal
-import sys
+import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 
 from uw_dslam_ros2.core.errors import UwDslamError
 
 __all__ = ["run_node"]
 
+_LOOK_UP_S = 0.2
+
+
+def _let_callbacks_end(executor: MultiThreadedExecutor) -> None:
+    """Wait for the callbacks at hand; the executor's own shutdown does not."""
+    executor.shutdown()
+    pool = getattr(executor, "_executor", None)
+    if pool is not None:
+        pool.shutdown(wait=True, cancel_futures=True)
+
 
 def run_node(name: str, make_node: Callable[[], Node], argv: Sequence[str] | None) -> int:
     """Spin a node until SIGINT or SIGTERM; return the process's exit code.
 
-    A node whose callbacks wait says in `num_threads` how many threads it needs. A wrong setting or
-    file ends it with one sentence and code 1, not with a traceback.
+    A node whose callbacks wait says in `num_threads` how many threads it needs, and has a method
+    `stop` that ends their waiting. A wrong setting or file ends the process with one sentence and
+    code 1, not with a traceback.
     """
-    rclpy.init(args=None if argv is None else list(argv))
+    # rclpy's own handlers would pull the context away under callbacks that still want to answer.
+    rclpy.init(
+        args=None if argv is None else list(argv), signal_handler_options=SignalHandlerOptions.NO
+    )
+    is_stopped = threading.Event()
+
+    def stop(*_: Any) -> None:
+        is_stopped.set()  # a second signal changes nothing: it must not tear the node half-way
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
     node: Node | None = None
     try:
         node = make_node()
         executor = MultiThreadedExecutor(getattr(node, "num_threads", 4))
         executor.add_node(node)
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
+        while not is_stopped.is_set():
+            executor.spin_once(timeout_sec=_LOOK_UP_S)
+        if hasattr(node, "stop"):
+            node.stop()
+        _let_callbacks_end(executor)
+    except ExternalShutdownException:
         pass
     except UwDslamError as error:
         get_logger(name).fatal(str(error))
         return 1
     finally:
-        # A second SIGINT while ending must not tear the node apart half-way.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         try_shutdown()
-        sys.stdout.flush()
     return 0

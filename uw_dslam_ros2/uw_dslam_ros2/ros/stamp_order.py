@@ -13,12 +13,12 @@ class StampOrder[ItemT]:
     """Holds items back until nothing earlier is to be expected.
 
     Sensors have queues of their own, and an executor empties them in any order. What a mapper
-    makes of its input must not depend on that. An item leaves when one has arrived that is
-    `hold_ns` younger; one that is later still than that leaves at once and is counted as late.
+    makes of its input must not depend on that. An item leaves when every stream that is alive has
+    come as far; a stream that is `hold_ns` behind the youngest item is not waited for.
 
     Parameters
     ----------
-    hold_ns : how much later than a younger one an item may arrive.
+    hold_ns : how long a stream is waited for, in the time of the stamps.
     jump_ns : a stream whose stamps go back by more than this has begun again.
     """
 
@@ -33,40 +33,50 @@ class StampOrder[ItemT]:
         """Forget everything."""
         self._heap: list[tuple[int, int, ItemT]] = []
         self._newest_of_stream: dict[str, int] = {}
-        self._newest_ns: int | None = None
+        self._alive: set[str] = set()
         self._released_ns: int | None = None
+
+    def __len__(self) -> int:
+        return len(self._heap)
 
     @property
     def newest_ns(self) -> int | None:
         """Stamp of the youngest item seen."""
-        return self._newest_ns
-
-    def __len__(self) -> int:
-        return len(self._heap)
+        return max(self._newest_of_stream.values(), default=None)
 
     def has_jumped_back(self, stream: str, stamp_ns: int) -> bool:
         """Whether this stamp shows that a recording began again."""
         newest_ns = self._newest_of_stream.get(stream)
         return newest_ns is not None and stamp_ns < newest_ns - self._jump_ns
 
+    def advance(self, stream: str, stamp_ns: int) -> None:
+        """Note that a stream has come so far, without an item."""
+        self._newest_of_stream[stream] = max(self._newest_of_stream.get(stream, 0), stamp_ns)
+        self._alive.add(stream)
+
     def add(self, stream: str, stamp_ns: int, item: ItemT) -> None:
-        """Take an item."""
-        newest_ns = self._newest_of_stream.get(stream, stamp_ns)
-        self._newest_of_stream[stream] = max(newest_ns, stamp_ns)
-        self._newest_ns = max(self._newest_ns or stamp_ns, stamp_ns)
+        """Take an item; one that is earlier than what has left is counted as late."""
+        self.advance(stream, stamp_ns)
         if self._released_ns is not None and stamp_ns < self._released_ns:
             self.num_late += 1
         heapq.heappush(self._heap, (stamp_ns, next(self._ties), item))
 
     def peek(self) -> ItemT | None:
         """The item that may leave next, or None while an earlier one may come."""
-        if not self._heap or self._newest_ns is None:
+        if not self._heap or not self._alive:
             return None
         stamp_ns, _, item = self._heap[0]
-        return item if stamp_ns <= self._newest_ns - self._hold_ns else None
+        return item if stamp_ns <= self._safe_ns() else None
+
+    def _safe_ns(self) -> int:
+        """Nothing earlier than this is to be expected."""
+        alive_ns = [self._newest_of_stream[stream] for stream in self._alive]
+        oldest_ns = max(alive_ns) - self._hold_ns
+        return min(stamp_ns for stamp_ns in alive_ns if stamp_ns >= oldest_ns)
 
     def rest(self) -> Iterator[ItemT]:
-        """All that is left, in the order of the stamps."""
+        """All that is left, in the order of the stamps; silent streams are waited for no more."""
+        self._alive.clear()
         while self._heap:
             yield self.pop()
 

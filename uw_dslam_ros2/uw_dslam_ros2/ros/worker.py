@@ -9,7 +9,7 @@ import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import TypeVar
+from typing import Any, TypeVar
 
 __all__ = ["Worker"]
 
@@ -26,28 +26,21 @@ class Worker:
     """
 
     def __init__(self, name: str, on_error: Callable[[Exception], None]) -> None:
-        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None]
+        self._jobs = queue.SimpleQueue()
         self._on_error = on_error
+        self._is_closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def post(self, job: Callable[[], None]) -> None:
-        """Have a job done, soon."""
-        self._jobs.put(job)
+        """Have a job done, soon; what it raises goes to `on_error`."""
+        self.call(job).add_done_callback(self._look_at)
 
     def call(self, job: Callable[[], T]) -> Future[T]:
         """Have a job done whose result or exception somebody waits for."""
         future: Future[T] = Future()
-
-        def run() -> None:
-            if not future.set_running_or_notify_cancel():
-                return
-            try:
-                future.set_result(job())
-            except Exception as error:  # noqa: BLE001 (whoever waits gets it)
-                future.set_exception(error)
-
-        self._jobs.put(run)
+        self._jobs.put((future, job))
         return future
 
     @property
@@ -56,13 +49,22 @@ class Worker:
         return self._jobs.qsize()
 
     def close(self, timeout_s: float | None = None) -> None:
-        """Finish the jobs posted so far, then end."""
+        """End after the job at hand; those that wait are cancelled."""
+        self._is_closing.set()
         self._jobs.put(None)
         self._thread.join(timeout_s)
 
+    def _look_at(self, future: Future[Any]) -> None:
+        if not future.cancelled() and isinstance(error := future.exception(), Exception):
+            self._on_error(error)
+
     def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
+        while (item := self._jobs.get()) is not None:
+            future, job = item
+            if self._is_closing.is_set():
+                future.cancel()
+                continue
             try:
-                job()
+                future.set_result(job())
             except Exception as error:  # noqa: BLE001 (a bad job must not end the thread)
-                self._on_error(error)
+                future.set_exception(error)

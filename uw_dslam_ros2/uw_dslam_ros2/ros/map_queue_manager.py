@@ -1,0 +1,477 @@
+"""Collects the submaps of all vehicles, has them registered, and publishes one global map."""
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from uw_dslam_msgs.msg import MergeStatus
+from uw_dslam_msgs.msg import Submap as SubmapMsg
+from uw_dslam_msgs.srv import (
+    GetSubmap,
+    ListSubmaps,
+    LoadSession,
+    RegisterMaps,
+    RestoreSubmap,
+    SaveMap,
+    SaveSession,
+    WithdrawSubmap,
+)
+from visualization_msgs.msg import MarkerArray
+
+from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
+from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest, SubmapState
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, load_session, save_session
+from uw_dslam_ros2.ros.conversions import (
+    occupancy_to_msg,
+    options_to_msg,
+    refused_registration,
+    registration_from_msg,
+    submap_from_msg,
+    submap_to_msg,
+)
+from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
+from uw_dslam_ros2.ros.map_publisher import MapPublisher
+from uw_dslam_ros2.ros.merge_messages import (
+    constraint_to_msg,
+    graph_to_markers,
+    record_to_msg,
+)
+from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.qos import LATCHED, SUBMAPS
+from uw_dslam_ros2.ros.registration_clients import RegistrationClients
+from uw_dslam_ros2.ros.running import run_node
+from uw_dslam_ros2.ros.worker import Worker
+
+__all__ = ["MapQueueManager", "MapQueueManagerConfig", "main"]
+
+_SUBMAP_TYPE = "uw_dslam_msgs/msg/Submap"
+_TICK_S = 0.1
+_STATUS_PERIOD_S = 1.0
+_DISCOVERY_PERIOD_S = 0.5
+_SERVICE_TIMEOUT_S = 600.0
+
+
+@dataclass(frozen=True, slots=True)
+class MapQueueManagerConfig(Config):
+    """Settings of the manager as a node; `queue` holds those of the map queue itself."""
+
+    vehicles: tuple[str, ...] = setting(
+        (), doc="vehicles whose submaps are taken; empty: every topic of type Submap on the graph"
+    )
+    servers: tuple[str, ...] = setting(
+        (), doc="registration servers (node names) that are asked; empty: all on the graph"
+    )
+    map_frame: str = setting("map", doc="frame of the global map")
+    requests_per_server: int = setting(2, 1, 1000, "registrations asked of one server at a time")
+    request_timeout_s: float = setting(
+        180.0, 0.1, 86400.0, "a registration not answered by then is asked again [s]"
+    )
+    publish_period_s: float = setting(
+        1.0, 0.0, 3600.0, "least time between two global maps, by a steady clock [s]"
+    )
+    full_map_period_s: float = setting(
+        5.0, 0.0, 3600.0, "between two whole maps while only parts change: those go as updates [s]"
+    )
+    session: str = setting(
+        "",
+        doc="folder: read at the start where it exists, written after every change; empty: none",
+    )
+
+
+class MapQueueManager(Node):
+    """Drives a `MapQueue` in a thread of its own; callbacks only hand it work."""
+
+    num_threads = 8
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("map_queue_manager", **kwargs)
+        self._config = declare_config(self, MapQueueManagerConfig)
+        self._queue_config = declare_config(self, MapQueueConfig, "queue")
+        refuse_unknown_parameters(self)
+        self._queue = MapQueue(self._queue_config)
+        self._message = "waiting for submaps"
+        self._counts: Counter[str] = Counter()
+        self._values: dict[str, float | int | str] = {}
+        self._asked: dict[int, MatchRequest] = {}
+        self._is_changed = True
+        self._is_saved = True
+        self._published_s = self._status_s = self._discovered_s = float("-inf")
+        self._sent_transforms: tuple[Any, ...] = ()
+        self._is_tick_posted = threading.Event()
+        if self._config.session:
+            self._resume(self._config.session)
+
+        self._map = MapPublisher(self, self._config.map_frame, self._config.full_map_period_s)
+        self._status_pub = self.create_publisher(MergeStatus, "merge_status", LATCHED)
+        self._graph_pub = self.create_publisher(MarkerArray, "pose_graph", LATCHED)
+        self._broadcaster = FrameBroadcaster(self)
+        self._group = ReentrantCallbackGroup()
+        self._topics: set[str] = set()
+        self._worker = Worker("map queue", self._on_worker_error)
+        self._servers = RegistrationClients(
+            self,
+            self._config.servers,
+            self._config.requests_per_server,
+            self._config.request_timeout_s,
+            self._worker.post,
+        )
+        for vehicle_id in self._config.vehicles:
+            self._subscribe(f"/{vehicle_id.strip('/')}/submap")
+        self._create_services()
+        self._diagnostics = Diagnostics(self, self._report, self._config.map_frame)
+        # Steady: registrations go on when a replay and its clock have ended.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_TICK_S, self._on_tick, clock=steady, callback_group=self._group)
+
+    def stop(self) -> None:
+        """End the worker after the job at hand; keep the session."""
+        self._worker.close(timeout_s=10.0)
+        if not self._is_saved and self._config.session:
+            self._is_saved = True
+            save_session(self._config.session, self._queue)
+
+    def destroy_node(self) -> None:
+        """Stop, then destroy."""
+        self.stop()
+        super().destroy_node()
+
+    def _create_services(self) -> None:
+        for service_type, name, handler in (
+            (SaveMap, "save_map", self._save_map),
+            (ListSubmaps, "list_submaps", self._list_submaps),
+            (GetSubmap, "get_submap", self._get_submap),
+            (WithdrawSubmap, "withdraw_submap", self._withdraw_submap),
+            (RestoreSubmap, "restore_submap", self._restore_submap),
+            (SaveSession, "save_session", self._save_session),
+            (LoadSession, "load_session", self._load_session),
+        ):
+            self.create_service(
+                service_type,
+                f"~/{name}",
+                functools.partial(self._serve, handler),
+                callback_group=self._group,
+            )
+
+    # --- callbacks ---------------------------------------------------------------------------
+
+    def _subscribe(self, topic: str) -> None:
+        if topic in self._topics:
+            return
+        self._topics.add(topic)
+        self.create_subscription(
+            SubmapMsg,
+            topic,
+            functools.partial(self._on_submap, topic),
+            SUBMAPS,
+            callback_group=self._group,
+        )
+        self.get_logger().info(f"taking submaps from {topic}")
+
+    def _on_submap(self, topic: str, msg: SubmapMsg) -> None:
+        self._counts["num_submap_messages"] += 1
+        try:
+            submap = submap_from_msg(msg)
+        except InvalidInputError as error:
+            self._complain(f"bad submap on {topic}: {error}")
+            return
+        self._worker.post(lambda: self._add_submap(topic, submap))
+
+    def _complain(self, text: str) -> None:
+        self._counts["num_bad"] += 1
+        self._message = text
+        self.get_logger().error(text, throttle_duration_sec=WARNING_PERIOD_S)
+
+    def _on_worker_error(self, error: Exception) -> None:
+        self._complain(f"{type(error).__name__}: {error}")
+
+    def _on_tick(self) -> None:
+        # While the worker is busy, ticks must not pile up.
+        if not self._is_tick_posted.is_set():
+            self._is_tick_posted.set()
+            self._worker.post(self._tick)
+
+    def _serve(self, handler: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
+        try:
+            job = self._worker.call(lambda: handler(request, response))
+            job.result(_SERVICE_TIMEOUT_S)
+        except Exception as error:  # noqa: BLE001 (a bad request must not end the node)
+            self._complain(f"{type(request).__name__}: {error}")
+            if hasattr(response, "FAILED"):
+                response.result = response.FAILED
+            if hasattr(response, "message"):
+                response.message = f"{type(error).__name__}: {error}"
+        return response
+
+    # --- in the worker's thread: submaps and registrations -----------------------------------
+
+    def _add_submap(self, topic: str, submap: Submap) -> None:
+        try:
+            self._queue.add_submap(submap)
+        except InvalidInputError as error:
+            self._complain(f"submap refused on {topic}: {error}")
+            return
+        self._changed(f"{submap.vehicle_id}/{submap.sequence} revision {submap.revision} received")
+
+    def _changed(self, message: str) -> None:
+        self._message = message
+        self._is_changed = True
+        self._is_saved = False
+
+    def _tick(self) -> None:
+        self._is_tick_posted.clear()
+        now_s = time.monotonic()
+        if now_s - self._discovered_s >= _DISCOVERY_PERIOD_S:
+            self._discovered_s = now_s
+            self._discover()
+        for request_id, reason in self._servers.take_lost():
+            self._ask_again(request_id, reason)
+        self._ask()
+        if self._is_changed and now_s - self._published_s >= self._config.publish_period_s:
+            self._is_changed = False
+            self._published_s = now_s
+            self._publish_map()
+            self._publish_status()
+        elif now_s - self._status_s >= _STATUS_PERIOD_S:
+            self._publish_status()
+        self._map.publish_overdue(self._now())
+        self._publish_transforms()
+        if not self._is_saved and self._config.session:
+            save_session(self._config.session, self._queue)
+            self._is_saved = True
+
+    def _discover(self) -> None:
+        self._servers.discover()
+        if not self._config.vehicles:
+            for topic, types in self.get_topic_names_and_types():
+                if _SUBMAP_TYPE in types:
+                    self._subscribe(topic)
+
+    def _ask(self) -> None:
+        room = self._servers.room()
+        if room <= 0:
+            return
+        for request in self._queue.next_requests(room):
+            msg = RegisterMaps.Request(options=options_to_msg(request.prior))
+            frames = (_frame_of(request.source_reference), _frame_of(request.target_reference))
+            msg.source = occupancy_to_msg(request.source, frames[0], 0)
+            msg.target = occupancy_to_msg(request.target, frames[1], 0)
+            if self._servers.ask(request.request_id, msg, self._on_answer):
+                self._asked[request.request_id] = request
+            else:
+                self._queue.cancel_request(request.request_id)
+
+    def _on_answer(self, request_id: int, response: RegisterMaps.Response) -> None:
+        request = self._asked.get(request_id)
+        if request is None:
+            return
+        if response.result == RegisterMaps.Response.BUSY:
+            self._ask_again(request_id, "the server is busy")
+            return
+        del self._asked[request_id]
+        if response.result == RegisterMaps.Response.DONE:
+            try:
+                result = registration_from_msg(response.registration)
+            except InvalidInputError as error:
+                result = refused_registration(f"unusable answer: {error}")
+        else:
+            result = refused_registration(f"the server could not answer: {response.message}")
+        self._counts[f"num_{result.verdict.name.lower()}"] += 1
+        self._queue.add_result(request_id, result)
+        pair = f"{_names(request.source_ids)} to {_names(request.target_ids)}"
+        self._changed(f"{pair}: {result.verdict.name}: {result.reason}")
+        self.get_logger().info(self._message)
+
+    def _ask_again(self, request_id: int, reason: str) -> None:
+        self._asked.pop(request_id, None)
+        self._queue.cancel_request(request_id)
+        self._counts["num_asked_again"] += 1
+        self.get_logger().warning(
+            f"registration {request_id} is asked again: {reason}",
+            throttle_duration_sec=WARNING_PERIOD_S,
+        )
+
+    # --- in the worker's thread: what is published -------------------------------------------
+
+    def _now(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _publish_map(self) -> None:
+        changed = self._queue.changed_window()
+        if changed is None:
+            return
+        evidence = self._queue.global_map()
+        if evidence is not None:
+            self._map.publish(evidence.to_occupancy(), changed[0], self._now())
+
+    def _publish_status(self) -> None:
+        self._status_s = time.monotonic()
+        stamp = self.get_clock().now().to_msg()
+        records, constraints = self._queue.submaps(), self._queue.constraints()
+        states = Counter(record.state for record in records)
+        msg = MergeStatus(
+            submaps=[record_to_msg(record) for record in records],
+            constraints=[constraint_to_msg(constraint) for constraint in constraints],
+            num_waiting=states[SubmapState.WAITING],
+            num_merged=states[SubmapState.MERGED],
+            num_components=len({record.component for record in records}),
+            num_registrations=self._queue.num_registrations,
+            num_in_flight=len(self._asked),
+            num_servers=self._servers.num_ready,
+            message=self._message,
+        )
+        msg.header.stamp = stamp
+        msg.header.frame_id = self._config.map_frame
+        self._status_pub.publish(msg)
+        markers = graph_to_markers(records, constraints, self._config.map_frame, stamp)
+        self._graph_pub.publish(markers)
+        self._values = {
+            name: getattr(msg, name)
+            for name in ("num_waiting", "num_merged", "num_components", "num_registrations")
+        }
+        self._values |= {"num_in_flight": msg.num_in_flight, "num_servers": msg.num_servers}
+        self._values["num_submaps"] = len(records)
+
+    def _publish_transforms(self) -> None:
+        """Map -> <vehicle>/map of the merged ones: when the clock moves, or a new reader comes."""
+        stamp_ns = self._now()
+        vehicle_ids = sorted({record.submap.vehicle_id for record in self._queue.submaps()})
+        places: list[tuple[str, SE2]] = []
+        for vehicle_id in vehicle_ids:
+            T_map_odom = self._queue.T_map_odom(vehicle_id)
+            if T_map_odom is not None:
+                places.append((vehicle_id, T_map_odom))
+        state = (stamp_ns, tuple(places), self._broadcaster.num_readers)
+        if not places or stamp_ns == 0 or state == self._sent_transforms:
+            return
+        self._sent_transforms = state
+        stamp = self.get_clock().now().to_msg()
+        frame_id = self._config.map_frame
+        self._broadcaster.send(
+            *(transform_to_msg(stamp, frame_id, f"{name}/map", T) for name, T in places)
+        )
+
+    # --- in the worker's thread: services ----------------------------------------------------
+
+    def _save_map(self, request: SaveMap.Request, response: SaveMap.Response) -> None:
+        evidence = self._queue.global_map()
+        if evidence is None:
+            response.result = response.NOTHING_TO_SAVE
+            response.message = "no submap received yet"
+            return
+        if not request.path:
+            raise InvalidInputError("path is empty, expected a file name without an ending")
+        response.files = [str(path) for path in write_map(request.path, evidence.to_occupancy())]
+        response.result = response.DONE
+        response.message = f"{len(response.files)} files written"
+
+    def _list_submaps(self, request: ListSubmaps.Request, response: ListSubmaps.Response) -> None:
+        response.submaps = [
+            record_to_msg(record)
+            for record in self._queue.submaps()
+            if request.vehicle_id in ("", record.submap.vehicle_id)
+        ]
+
+    def _get_submap(self, request: GetSubmap.Request, response: GetSubmap.Response) -> None:
+        submap_id = (request.vehicle_id, int(request.sequence))
+        for record in self._queue.submaps():
+            if record.submap.submap_id == submap_id:
+                response.result = response.DONE
+                response.submap = submap_to_msg(record.submap)
+                response.info = record_to_msg(record)
+                return
+        response.result = response.NOT_FOUND
+        response.message = _not_found(submap_id)
+
+    def _withdraw_submap(self, request: Any, response: Any) -> None:
+        self._switch(request, response, self._queue.withdraw, "withdrawn")
+
+    def _restore_submap(self, request: Any, response: Any) -> None:
+        self._switch(request, response, self._queue.restore, "back in the queue")
+
+    def _switch(
+        self, request: Any, response: Any, act: Callable[[SubmapId], bool], word: str
+    ) -> None:
+        submap_id = (request.vehicle_id, int(request.sequence))
+        if not act(submap_id):
+            response.result, response.message = response.NOT_FOUND, _not_found(submap_id)
+            return
+        response.result = response.DONE
+        response.message = f"{request.vehicle_id}/{request.sequence} {word}"
+        self._changed(response.message)
+
+    def _save_session(self, request: SaveSession.Request, response: SaveSession.Response) -> None:
+        if not request.path:
+            raise InvalidInputError("path is empty, expected a folder")
+        paths = [save_session(request.path, self._queue), *export_queue(request.path, self._queue)]
+        response.files = [str(path) for path in paths]
+        response.result = response.DONE
+        response.message = f"{len(response.files)} files written"
+
+    def _load_session(self, request: LoadSession.Request, response: LoadSession.Response) -> None:
+        if not has_session(request.path):
+            response.result = response.NOT_FOUND
+            response.message = f"there is no {SESSION_FILE} in {request.path!r}"
+            return
+        queue = load_session(request.path, self._queue_config)
+        self._servers.forget_all()
+        self._asked.clear()
+        self._queue = queue
+        self._map.clear()
+        response.result = response.DONE
+        response.num_submaps = len(queue.submaps())
+        response.message = f"{response.num_submaps} submaps loaded"
+        self._changed(response.message)
+
+    def _resume(self, path: str) -> None:
+        """Go on where a session ended; a damaged one ends the start with a clear sentence."""
+        if has_session(path):
+            self._queue = load_session(path, self._queue_config)
+            self._message = f"session {path} resumed"
+        else:
+            self._message = f"a new session begins in {path}"
+        self.get_logger().info(self._message)
+
+    def _report(self) -> Report:
+        values = {**self._values, **dict(sorted(self._counts.items()))}
+        values["num_jobs_waiting"] = self._worker.num_waiting
+        num_servers = self._values.get("num_servers", 0)
+        is_well = num_servers != 0
+        return is_well, self._message if is_well else "no registration server on the graph", values
+
+
+def has_session(path: str) -> bool:
+    """Whether a folder holds a session."""
+    return (Path(path) / SESSION_FILE).is_file()
+
+
+def _frame_of(submap_id: SubmapId) -> str:
+    return f"{submap_id[0]}/submap_{submap_id[1]}"
+
+
+def _names(submap_ids: Sequence[SubmapId]) -> str:
+    first = f"{submap_ids[0][0]}/{submap_ids[0][1]}"
+    return first if len(submap_ids) == 1 else f"{first} and {len(submap_ids) - 1} more"
+
+
+def _not_found(submap_id: SubmapId) -> str:
+    return f"no submap {submap_id[0]}/{submap_id[1]}; ~/list_submaps lists them"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Manage until stopped."""
+    return run_node("map_queue_manager", MapQueueManager, argv)

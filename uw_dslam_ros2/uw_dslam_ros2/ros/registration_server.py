@@ -1,0 +1,349 @@
+"""Aligns maps for whoever asks: two services, and an action that tells how the proof goes."""
+
+from __future__ import annotations
+
+import functools
+import os
+import socket
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from nav_msgs.msg import OccupancyGrid
+from numpy.typing import NDArray
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from uw_dslam_msgs.action import RegisterMaps as RegisterMapsAction
+from uw_dslam_msgs.srv import RegisterMaps, RegisterPointSets
+
+from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.registration import (
+    GridRegistrationConfig,
+    RegistrationConfig,
+    register_grids,
+    register_point_sets,
+)
+from uw_dslam_ros2.core.registration.result import Progress, RegistrationResult, Verdict
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.ros.conversions import (
+    occupancy_from_msg,
+    options_from_msg,
+    registration_to_msg,
+    transform2d_to_msg,
+)
+from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.registration_jobs import Job, RegistrationJobs, Search
+from uw_dslam_ros2.ros.running import run_node
+
+__all__ = ["RegistrationServer", "RegistrationServerConfig", "main"]
+
+_FEEDBACK_PERIOD_S = 0.25
+_POLL_S = 0.02
+_CANCEL_PATIENCE_S = 0.05
+_NUM_LATENCIES = 200
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationServerConfig(Config):
+    """Settings of the registration server."""
+
+    max_parallel: int = setting(0, 0, 256, "searches at a time; 0: as many as cores")
+    max_waiting: int = setting(4, 0, 1000, "requests that wait for their turn; more get BUSY")
+    max_cells: int = setting(
+        36_000_000, 1, 1_000_000_000, "largest map that is accepted, in cells (6000 x 6000)"
+    )
+    max_points: int = setting(100_000, 1, 10_000_000, "largest point set that is accepted")
+
+
+class RegistrationServer(Node):
+    """Services ``~/register_maps`` and ``~/register_point_sets``, action ``~/register_maps``."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("registration_server", **kwargs)
+        self._config = declare_config(self, RegistrationServerConfig)
+        self._grid_config = declare_config(self, GridRegistrationConfig, "registration")
+        self._point_config = declare_config(self, RegistrationConfig, "points")
+        refuse_unknown_parameters(self)
+        self._jobs = RegistrationJobs(self._config.max_parallel, self._config.max_waiting)
+        self.num_threads = self._jobs.max_accepted + 4
+        self._statistics = _Statistics()
+        group = ReentrantCallbackGroup()
+        self.create_service(
+            RegisterMaps, "~/register_maps", self._on_register_maps, callback_group=group
+        )
+        self.create_service(
+            RegisterPointSets,
+            "~/register_point_sets",
+            self._on_register_point_sets,
+            callback_group=group,
+        )
+        self._action = ActionServer(
+            self,
+            RegisterMapsAction,
+            "~/register_maps",
+            self._execute,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            callback_group=group,
+        )
+        # New with every start: whoever waits for an answer sees that its server is gone.
+        instance = f"{socket.gethostname()}:{os.getpid()}:{time.time_ns()}"
+        self._diagnostics = Diagnostics(self, self._report, instance)
+
+    def stop(self) -> None:
+        """Stop the searches, so that whoever waits for them gets an answer."""
+        self._jobs.close()
+
+    def destroy_node(self) -> None:
+        """Stop, then destroy."""
+        self.stop()
+        self._action.destroy()
+        super().destroy_node()
+
+    # --- services ----------------------------------------------------------------------------
+
+    def _on_register_maps(
+        self, request: RegisterMaps.Request, response: RegisterMaps.Response
+    ) -> RegisterMaps.Response:
+        return self._answer(lambda: self._search_of_maps(request), response)
+
+    def _on_register_point_sets(
+        self, request: RegisterPointSets.Request, response: RegisterPointSets.Response
+    ) -> RegisterPointSets.Response:
+        return self._answer(lambda: self._search_of_points(request), response)
+
+    def _answer(self, make_search: Any, response: Any) -> Any:
+        job = self._begin(make_search, response)
+        if job is not None:
+            job.wait()
+            self._finish(job, response)
+        return response
+
+    def _begin(self, make_search: Any, response: Any) -> Job | None:
+        """Begin what a request asks for; None where it is refused, as the response then says."""
+        try:
+            search: Search = make_search()
+        except InvalidInputError as error:
+            response.result, response.message = response.INVALID_INPUT, str(error)
+            self._statistics.count("invalid_input")
+            return None
+        except Exception as error:  # noqa: BLE001 (a server survives whatever it is sent)
+            response.result, response.message = response.FAILED, f"{type(error).__name__}: {error}"
+            self.get_logger().error(response.message)
+            self._statistics.count("failed")
+            return None
+        job = self._jobs.submit(search)
+        if job is None:
+            response.result = response.BUSY
+            response.message = (
+                f"{self._jobs.max_accepted} registrations are running or waiting, which is the "
+                "limit (max_parallel + max_waiting); ask again later"
+            )
+            self._statistics.count("busy")
+        return job
+
+    def _finish(self, job: Job, response: Any) -> None:
+        """Put the outcome of a finished job into a response."""
+        try:
+            result = job.future.result()
+        except InvalidInputError as error:
+            response.result, response.message = response.INVALID_INPUT, str(error)
+            self._statistics.count("invalid_input")
+        except Exception as error:  # noqa: BLE001 (a server survives whatever it is sent)
+            response.result, response.message = response.FAILED, f"{type(error).__name__}: {error}"
+            self.get_logger().error(f"registration failed: {response.message}")
+            self._statistics.count("failed")
+        else:
+            response.result = response.DONE
+            response.registration = registration_to_msg(result)
+            self._statistics.count(result.verdict.name.lower())
+            self._statistics.add_latency(time.monotonic() - job.begun_s)
+
+    # --- what is asked -----------------------------------------------------------------------
+
+    def _search_of_maps(self, request: Any) -> Search:
+        source = self._map_of(request.source, "source")
+        target = self._map_of(request.target, "target")
+        prior, max_seconds = options_from_msg(request.options)
+        config = limited(self._grid_config, max_seconds)
+        return functools.partial(
+            register_grids, source, target, config, prior=prior, clock=time.monotonic
+        )
+
+    def _map_of(self, msg: OccupancyGrid, name: str) -> OccupancyMap:
+        num_cells = int(msg.info.width) * int(msg.info.height)
+        if num_cells > self._config.max_cells:
+            raise InvalidInputError(
+                f"{name} has {msg.info.height} x {msg.info.width} = {num_cells} cells, expected "
+                f"at most {self._config.max_cells} (parameter max_cells)"
+            )
+        return occupancy_from_msg(msg, name)
+
+    def _search_of_points(self, request: RegisterPointSets.Request) -> Search:
+        prior, max_seconds = options_from_msg(request.options)
+        source = self._points_of(request.source, "source")
+        target = self._points_of(request.target, "target")
+        if not (np.isfinite(request.sigma_m) and request.sigma_m >= 0.0):
+            raise InvalidInputError(
+                f"sigma_m is {request.sigma_m} m, expected 0 (derived) or a positive number"
+            )
+        config = limited(self._point_config, max_seconds)
+        sigma_m = float(request.sigma_m) or None
+        return functools.partial(
+            register_point_sets,
+            source,
+            target,
+            config,
+            source_sigma_m=sigma_m,
+            target_sigma_m=sigma_m,
+            prior=prior,
+            clock=time.monotonic,
+        )
+
+    def _points_of(self, msgs: Sequence[Any], name: str) -> NDArray[np.float64]:
+        if len(msgs) > self._config.max_points:
+            raise InvalidInputError(
+                f"{name} has {len(msgs)} points, expected at most {self._config.max_points} "
+                "(parameter max_points)"
+            )
+        points = np.array([(p.x, p.y) for p in msgs], dtype=np.float64).reshape(-1, 2)
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        if len(bad):
+            raise InvalidInputError(
+                f"{name}[{bad[0]}] is {points[bad[0]].tolist()}, expected finite metres"
+            )
+        return points
+
+    # --- action ------------------------------------------------------------------------------
+
+    def _execute(self, goal: ServerGoalHandle) -> RegisterMapsAction.Result:
+        result = RegisterMapsAction.Result()
+        job = self._begin(lambda: self._search_of_maps(goal.request), result)
+        if job is None:
+            goal.abort()
+            return result
+        is_cancelled = self._follow(goal, job)
+        if is_cancelled and not job.wait(_CANCEL_PATIENCE_S):
+            # Answered now; the search stops at its next look, and keeps its place until then.
+            result.result = result.DONE
+            result.registration = registration_to_msg(_best_so_far(job))
+            self._statistics.count("cancelled")
+        else:
+            self._finish(job, result)
+        if is_cancelled:
+            goal.canceled()
+        elif result.result == result.DONE:
+            goal.succeed()
+        else:
+            goal.abort()
+        return result
+
+    def _follow(self, goal: ServerGoalHandle, job: Job) -> bool:
+        """Send feedback until the job ends; True when the client cancelled it."""
+        sent_s = 0.0
+        while not job.wait(_POLL_S):
+            if goal.is_cancel_requested:
+                job.cancel()
+                return True
+            now_s = time.monotonic()
+            if job.newest is not None and now_s - sent_s >= _FEEDBACK_PERIOD_S:
+                sent_s = now_s
+                goal.publish_feedback(_feedback(job.newest, now_s - job.begun_s))
+        return bool(goal.is_cancel_requested)
+
+    def _report(self) -> Report:
+        counts = self._jobs.counts
+        values = {
+            "num_running": counts.num_running,
+            "num_waiting": counts.num_waiting,
+            "max_parallel": self._jobs.max_parallel,
+            **self._statistics.values(),
+        }
+        is_full = counts.num_running + counts.num_waiting >= self._jobs.max_accepted
+        text = f"{counts.num_running} running, {counts.num_waiting} waiting"
+        return not is_full, text, values
+
+
+def limited[ConfigT: Config](config: ConfigT, max_seconds: float) -> ConfigT:
+    """Settings with the caller's time limit; 0 keeps the server's."""
+    if max_seconds == 0.0:
+        return config
+    return type(config).from_dict({**config.to_dict(), "max_seconds": max_seconds})
+
+
+def _feedback(progress: Progress, seconds: float) -> RegisterMapsAction.Feedback:
+    return RegisterMapsAction.Feedback(
+        stage=progress.stage,
+        lower_bound=float(progress.lower_bound),
+        upper_bound=float(progress.upper_bound),
+        gap=float(progress.gap),
+        num_boxes=int(progress.num_boxes),
+        num_open_boxes=int(progress.num_open_boxes),
+        seconds=float(seconds),
+        t_target_source=transform2d_to_msg(progress.T_target_source),
+    )
+
+
+def _best_so_far(job: Job) -> RegistrationResult:
+    """What a search that was stopped had proven."""
+    newest = job.newest
+    return RegistrationResult(
+        verdict=Verdict.BUDGET_EXHAUSTED,
+        reason="cancelled before the proof was complete; this is the best found so far",
+        T_target_source=newest.T_target_source if newest else SE2(),
+        covariance=np.full((3, 3), np.nan),
+        probability=0.0,
+        score=newest.lower_bound if newest else 0.0,
+        lower_bound=newest.lower_bound if newest else 0.0,
+        upper_bound=newest.upper_bound if newest else 1.0,
+        is_certified=False,
+        num_boxes=newest.num_boxes if newest else 0,
+        seconds=time.monotonic() - job.begun_s,
+        overlap=float("nan"),
+        conflict_ratio=float("nan"),
+        inlier_ratio=float("nan"),
+        num_source_points=0,
+        num_target_points=0,
+    )
+
+
+class _Statistics:
+    """Outcomes and latencies since the start."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._outcomes: Counter[str] = Counter()
+        self._latencies_s: deque[float] = deque(maxlen=_NUM_LATENCIES)
+
+    def count(self, outcome: str) -> None:
+        with self._lock:
+            self._outcomes[outcome] += 1
+
+    def add_latency(self, seconds: float) -> None:
+        with self._lock:
+            self._latencies_s.append(seconds)
+
+    def values(self) -> dict[str, float | int | str]:
+        with self._lock:
+            values: dict[str, float | int | str] = {
+                f"num_{outcome}": count for outcome, count in sorted(self._outcomes.items())
+            }
+            latencies_s = list(self._latencies_s)
+        if latencies_s:
+            values["latency_median_s"] = float(np.median(latencies_s))
+            values["latency_p95_s"] = float(np.percentile(latencies_s, 95))
+            values["latency_newest_s"] = latencies_s[-1]
+        return values
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Serve until stopped."""
+    return run_node("registration_server", RegistrationServer, argv)

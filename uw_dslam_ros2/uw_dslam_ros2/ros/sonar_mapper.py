@@ -1,0 +1,422 @@
+"""One vehicle's mapper: sensors in; submaps, its own map, odometry and TF out."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from marine_acoustic_msgs.msg import Dvl, ProjectedSonarImage
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import FluidPressure, Imu, LaserScan, PointCloud2
+from std_srvs.srv import Trigger
+from uw_dslam_msgs.msg import Submap as SubmapMsg
+
+from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.errors import ConfigError, InvalidInputError
+from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.submap import Submap
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io import messages
+from uw_dslam_ros2.io.events import (
+    DepthEvent,
+    ImageEvent,
+    ImuEvent,
+    PointsEvent,
+    ScanEvent,
+    VelocityEvent,
+)
+from uw_dslam_ros2.ros.conversions import (
+    occupancy_to_msg,
+    path_to_msg,
+    pose_with_covariance_to_msg,
+    stamp_to_msg,
+    submap_to_msg,
+)
+from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.feeding import SensorEvent, feed
+from uw_dslam_ros2.ros.frames import (
+    WARNING_PERIOD_S,
+    FrameBroadcaster,
+    Mounts,
+    transform_to_msg,
+)
+from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
+from uw_dslam_ros2.ros.running import run_node
+from uw_dslam_ros2.ros.stamp_order import StampOrder
+from uw_dslam_ros2.ros.worker import Worker
+
+__all__ = ["SonarMapper", "SonarMapperConfig", "main"]
+
+_PINGS = (ImageEvent, ScanEvent, PointsEvent)
+_MAX_AHEAD_NS = 10_000_000_000
+_MOUNT_PATIENCE_NS = 5_000_000_000
+_ODOM_PERIOD_NS = 100_000_000
+_FINISH_TIMEOUT_S = 600.0
+_IDLE_S = 4.0  # longer than the repair of a lost message takes
+
+
+@dataclass(frozen=True, slots=True)
+class SonarMapperConfig(Config):
+    """Settings of the sonar mapper as a node; `mapper` holds those of the mapping itself."""
+
+    vehicle_id: str = setting("", doc="the vehicle's name; empty: the node's namespace")
+    base_frame: str = setting("", doc="frame of the vehicle's body; empty: <vehicle>/base_link")
+    input: str = setting(
+        "image",
+        choices=("image", "scan", "points"),
+        doc="what the sonar sends: topic sonar, scan or points",
+    )
+    data_order: str = setting(
+        "range_major", choices=messages.DATA_ORDERS, doc="slowest index of a sonar image's bytes"
+    )
+    velocity: str = setting(
+        "dvl",
+        choices=("dvl", "twist"),
+        doc="type of the topic dvl: Dvl or TwistWithCovarianceStamped",
+    )
+    water_density_kg_m3: float = setting(
+        1025.0, 900.0, 1300.0, "turns pressure into depth; fresh water has 1000"
+    )
+    is_reliable: bool = setting(
+        False, doc="subscribe to sensors reliably: for replays, where nothing may be lost"
+    )
+    ping_queue: int = setting(100, 1, 100000, "pings kept while the mapper is busy")
+    sensor_queue: int = setting(5000, 1, 1000000, "other messages kept while the mapper is busy")
+    reorder_s: float = setting(
+        1.0, 0.0, 600.0, "a sensor is waited for this long, so that all is used in order [s]"
+    )
+    jump_back_s: float = setting(
+        1.0, 0.01, 1e6, "stamps that go back by more begin a new recording: all starts afresh [s]"
+    )
+    map_period_s: float = setting(2.0, 0.1, 3600.0, "between two maps, by the pings' stamps [s]")
+    path_max_poses: int = setting(2000, 2, 1000000, "a longer path is thinned when published")
+
+
+class SonarMapper(Node):
+    """Drives a `VehicleMapper`; all topics are relative, so that a namespace makes a vehicle."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("sonar_mapper", **kwargs)
+        self._config = declare_config(self, SonarMapperConfig)
+        self._mapper_config = declare_config(self, VehicleMapperConfig, "mapper")
+        refuse_unknown_parameters(self)
+        self._vehicle_id = self._config.vehicle_id or self.get_namespace().strip("/")
+        if not self._vehicle_id:
+            raise ConfigError(
+                "parameter vehicle_id is empty and the node has no namespace; "
+                "give one of them (-r __ns:=/auv_1)"
+            )
+        self._base_frame = self._config.base_frame or f"{self._vehicle_id}/base_link"
+        self._mapper = VehicleMapper(self._mapper_config, self._vehicle_id)
+        self._order: StampOrder[SensorEvent] = StampOrder(
+            int(self._config.reorder_s * 1e9), int(self._config.jump_back_s * 1e9)
+        )
+        self._counts: Counter[str] = Counter()
+        self._mapper_values: dict[str, float | int | str] = {}
+        self._last_problem = ""
+        self._odom_stamp_ns = 0
+        self._map_stamp_ns = 0
+        self._is_finished = False
+        self._heard_s = time.monotonic()
+        self._worker = Worker("mapper", self._on_worker_error)
+        self._create_publishers()
+        group = MutuallyExclusiveCallbackGroup()
+        self._mounts = Mounts(self, lambda: self._worker.post(self._drain), callback_group=group)
+        self._expected_types: dict[str, str] = {}
+        self._streams: list[str] = []
+        self._create_subscriptions(group)
+        self.create_service(
+            Trigger, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup()
+        )
+        self._diagnostics = Diagnostics(self, self._report, self._vehicle_id)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._on_idle_timer, clock=steady, callback_group=group)
+        self.get_logger().info(
+            f"mapping {self._vehicle_id} from {self._config.input}, body frame {self._base_frame}"
+        )
+
+    def stop(self) -> None:
+        """End the worker after the job at hand."""
+        self._worker.close(timeout_s=5.0)
+
+    def destroy_node(self) -> None:
+        """Stop, then destroy."""
+        self.stop()
+        super().destroy_node()
+
+    def _create_publishers(self) -> None:
+        self._submap_pub = self.create_publisher(SubmapMsg, "submap", SUBMAPS)
+        self._map_pub = self.create_publisher(OccupancyGrid, "map", LATCHED)
+        self._path_pub = self.create_publisher(Path, "path", LATCHED)
+        self._odom_pub = self.create_publisher(Odometry, "odom", DEFAULT)
+        self._broadcaster = FrameBroadcaster(self)
+
+    def _create_subscriptions(self, group: Any) -> None:
+        ping_type, ping_topic, to_event = {
+            "image": (ProjectedSonarImage, "sonar", self._image_of),
+            "scan": (LaserScan, "scan", self._scan_of),
+            "points": (PointCloud2, "points", self._points_of),
+        }[self._config.input]
+        is_dvl = self._config.velocity == "dvl"
+        velocity_type = Dvl if is_dvl else TwistWithCovarianceStamped
+        sensors: Iterable[tuple[Any, str, Callable[[Any], SensorEvent | None], int]] = (
+            (ping_type, ping_topic, to_event, self._config.ping_queue),
+            (velocity_type, "dvl", self._velocity_of, self._config.sensor_queue),
+            (Imu, "imu", self._imu_of, self._config.sensor_queue),
+            (FluidPressure, "depth", self._depth_of, self._config.sensor_queue),
+        )
+        for msg_type, topic, convert, depth in sensors:
+            self.create_subscription(
+                msg_type,
+                topic,
+                functools.partial(self._on_message, topic, convert),
+                sensor_qos(depth, is_reliable=self._config.is_reliable),
+                callback_group=group,
+            )
+            self._streams.append(topic)
+            full_name = self.resolve_topic_name(topic)
+            package = msg_type.__module__.split(".")[0]
+            self._expected_types[full_name] = f"{package}/msg/{msg_type.__name__}"
+
+    # --- messages to events ------------------------------------------------------------------
+
+    def _key(self, msg: Any) -> tuple[str, int, str]:
+        return self._vehicle_id, messages.stamp_of(msg), msg.header.frame_id
+
+    def _image_of(self, msg: Any) -> SensorEvent:
+        image = messages.sonar_image_of(msg, self._config.data_order)
+        return ImageEvent(*self._key(msg), image)
+
+    def _scan_of(self, msg: Any) -> SensorEvent:
+        return ScanEvent(*self._key(msg), *messages.scan_of_laser_scan(msg))
+
+    def _points_of(self, msg: Any) -> SensorEvent:
+        return PointsEvent(*self._key(msg), messages.points_of_cloud(msg))
+
+    def _imu_of(self, msg: Any) -> SensorEvent:
+        return ImuEvent(*self._key(msg), *messages.yaw_of_imu(msg))
+
+    def _depth_of(self, msg: Any) -> SensorEvent:
+        depth_m = messages.depth_of_pressure(msg, self._config.water_density_kg_m3)
+        return DepthEvent(*self._key(msg), depth_m)
+
+    def _velocity_of(self, msg: Any) -> SensorEvent | None:
+        is_dvl = self._config.velocity == "dvl"
+        value = messages.velocity_of_dvl(msg) if is_dvl else messages.velocity_of_twist(msg)
+        return None if value is None else VelocityEvent(*self._key(msg), *value)
+
+    def _on_message(
+        self, topic: str, convert: Callable[[Any], SensorEvent | None], msg: Any
+    ) -> None:
+        self._counts[f"num_{topic}"] += 1
+        self._heard_s = time.monotonic()
+        try:
+            self._check_stamp(msg)
+            event = convert(msg)
+        except InvalidInputError as error:
+            self._complain(f"bad message on {topic}: {error}")
+            return
+        except (ValueError, TypeError, OverflowError) as error:
+            self._complain(f"bad message on {topic}: {type(error).__name__}: {error}")
+            return
+        if event is None:
+            self._counts["num_no_velocity"] += 1
+        self._worker.post(functools.partial(self._take, topic, messages.stamp_of(msg), event))
+
+    def _check_stamp(self, msg: Any) -> None:
+        stamp_ns = messages.stamp_of(msg)
+        if stamp_ns <= 0:
+            raise InvalidInputError(
+                f"header.stamp is {stamp_ns * 1e-9} s, expected the time of the measurement"
+            )
+        now_ns = self.get_clock().now().nanoseconds
+        if 0 < now_ns < stamp_ns - _MAX_AHEAD_NS:
+            raise InvalidInputError(
+                f"header.stamp is {(stamp_ns - now_ns) * 1e-9:.1f} s ahead of the clock, "
+                f"expected at most {_MAX_AHEAD_NS * 1e-9:.0f} s"
+            )
+
+    def _complain(self, text: str) -> None:
+        self._counts["num_bad"] += 1
+        self._last_problem = text
+        self.get_logger().error(text, throttle_duration_sec=WARNING_PERIOD_S)
+
+    def _on_worker_error(self, error: Exception) -> None:
+        self._complain(f"{type(error).__name__}: {error}")
+
+    # --- in the worker's thread --------------------------------------------------------------
+
+    def _take(self, stream: str, stamp_ns: int, event: SensorEvent | None) -> None:
+        """Put an event in line; None only says how far the stream has come."""
+        if self._order.has_jumped_back(stream, stamp_ns):
+            self.get_logger().warning(
+                f"time went back on {stream}: a recording began again, and so does the map"
+            )
+            self._restart()
+        if self._is_finished:
+            self._complain(f"mapping was finished; messages on {stream} are left out")
+            return
+        if self._order.newest_ns is None:
+            self._expect_streams(stamp_ns)
+        if event is None:
+            self._order.advance(stream, stamp_ns)
+        else:
+            self._order.add(stream, stamp_ns, event)
+        self._drain()
+
+    def _expect_streams(self, stamp_ns: int) -> None:
+        """At the start, wait for the first message of every sensor that somebody sends."""
+        for topic in self._streams:
+            if self.count_publishers(topic):
+                self._order.advance(topic, stamp_ns - int(self._config.jump_back_s * 1e9))
+
+    def _restart(self) -> None:
+        self._order.clear()
+        self._mapper = VehicleMapper(self._mapper_config, self._vehicle_id)
+        self._odom_stamp_ns = self._map_stamp_ns = 0
+        self._is_finished = False
+        self._counts["num_restarts"] += 1
+
+    def _on_idle_timer(self) -> None:
+        """When nothing comes any more, what was held back for others is used all the same."""
+        if time.monotonic() - self._heard_s > _IDLE_S:
+            self._worker.post(self._flush)
+
+    def _flush(self) -> None:
+        for event in self._order.rest():
+            self._feed(event)
+
+    def _drain(self) -> None:
+        """Feed what is due, in the order of the stamps."""
+        while (event := self._order.peek()) is not None:
+            newest_ns = self._order.newest_ns or event.stamp_ns
+            is_patient = newest_ns - event.stamp_ns < _MOUNT_PATIENCE_NS
+            if is_patient and not self._is_mounted(event):
+                return  # /tf_static is on its way
+            self._feed(self._order.pop())
+
+    def _is_mounted(self, event: SensorEvent) -> bool:
+        if isinstance(event, DepthEvent):
+            return True
+        return self._mounts.lookup(self._base_frame, event.frame_id) is not None
+
+    def _feed(self, event: SensorEvent) -> None:
+        frame_id = self._base_frame if isinstance(event, DepthEvent) else event.frame_id
+        T_base_sensor = self._mounts.lookup(self._base_frame, frame_id)
+        if T_base_sensor is None:
+            self._complain(
+                f"/tf_static does not say where {event.frame_id} is on {self._base_frame}; "
+                "its messages are left out"
+            )
+            return
+        try:
+            submaps = feed(self._mapper, event, T_base_sensor)
+        except InvalidInputError as error:
+            self._complain(f"{type(event).__name__} of {event.frame_id}: {error}")
+            return
+        self._publish_submaps(submaps)
+        stamp_ns = self._mapper.stamp_ns
+        if stamp_ns is None:
+            return
+        if stamp_ns - self._odom_stamp_ns >= _ODOM_PERIOD_NS:
+            self._publish_odometry(stamp_ns)
+        if isinstance(event, _PINGS):
+            self._mapper_values = self._mapper.diagnostics()
+            if stamp_ns - self._map_stamp_ns >= self._config.map_period_s * 1e9:
+                self._publish_map(stamp_ns)
+
+    def _finish(self) -> str:
+        if self._is_finished:
+            return "finished before; nothing changes"
+        self._flush()
+        submaps = self._mapper.finish()
+        self._publish_submaps(submaps)
+        self._is_finished = True
+        stamp_ns = self._mapper.stamp_ns
+        if stamp_ns is not None:
+            self._publish_odometry(stamp_ns)
+            self._publish_map(stamp_ns)
+        self._mapper_values = self._mapper.diagnostics()
+        return (
+            f"{self._mapper_values['num_pings']} pings mapped into "
+            f"{self._mapper_values['num_submaps']} submaps; {self._counts['num_bad']} bad messages"
+        )
+
+    def _publish_submaps(self, submaps: Iterable[Submap]) -> None:
+        for submap in submaps:
+            self._counts["num_submap_messages"] += 1
+            self._submap_pub.publish(submap_to_msg(submap))
+
+    def _publish_odometry(self, stamp_ns: int) -> None:
+        self._odom_stamp_ns = stamp_ns
+        stamp = stamp_to_msg(stamp_ns)
+        odom_frame, T_odom_base = f"{self._vehicle_id}/odom", self._mapper.T_odom_base
+        velocity_m_s, yaw_rate_rad_s = self._mapper.velocity
+        msg = Odometry(child_frame_id=self._base_frame)
+        msg.header.stamp = stamp
+        msg.header.frame_id = odom_frame
+        msg.pose = pose_with_covariance_to_msg(T_odom_base, self._mapper.pose_covariance)
+        msg.twist.twist.linear.x = float(velocity_m_s[0])
+        msg.twist.twist.linear.y = float(velocity_m_s[1])
+        msg.twist.twist.angular.z = float(yaw_rate_rad_s)
+        self._odom_pub.publish(msg)
+        self._broadcaster.send(
+            transform_to_msg(stamp, f"{self._vehicle_id}/map", odom_frame, SE2()),
+            transform_to_msg(stamp, odom_frame, self._base_frame, T_odom_base),
+        )
+
+    def _publish_map(self, stamp_ns: int) -> None:
+        self._map_stamp_ns = stamp_ns
+        stamps_ns, poses = self._mapper.trajectory()
+        if not len(poses):
+            return
+        frame_id = f"{self._vehicle_id}/map"
+        occupancy = self._mapper.vehicle_map()
+        self._map_pub.publish(occupancy_to_msg(occupancy, frame_id, stamp_ns))
+        self._path_pub.publish(
+            path_to_msg(stamps_ns, poses, frame_id, stamp_ns, self._config.path_max_poses)
+        )
+
+    # --- services and diagnostics ------------------------------------------------------------
+
+    def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message = self._worker.call(self._finish).result(_FINISH_TIMEOUT_S)
+            response.success = True
+        except Exception as error:  # noqa: BLE001 (the caller gets it)
+            response.success = False
+            response.message = f"{type(error).__name__}: {error}"
+        self.get_logger().info(f"finish: {response.message}")
+        return response
+
+    def _report(self) -> Report:
+        for topic, expected in self._expected_types.items():
+            for info in self.get_publishers_info_by_topic(topic):
+                if info.topic_type != expected:
+                    self._complain(
+                        f"topic {topic} has type {info.topic_type}, expected {expected}"
+                    )
+        values = {
+            **dict(sorted(self._counts.items())),
+            "num_late": self._order.num_late,
+            "num_waiting": self._worker.num_waiting,
+            **self._mapper_values,
+        }
+        num_pings = self._mapper_values.get("num_pings", 0)
+        if not num_pings:
+            return False, self._last_problem or "no ping mapped yet", values
+        return True, self._last_problem or f"{num_pings} pings mapped", values
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Map until stopped."""
+    return run_node("sonar_mapper", SonarMapper, argv)
