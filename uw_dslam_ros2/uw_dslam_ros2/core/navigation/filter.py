@@ -31,12 +31,15 @@ _ORDER = {YawRate: 0, Yaw: 1, Velocity: 2, Fix: 3, Clone: 4}
 _WAIT_FOR_YAW_NS = 1_000_000_000
 _UNKNOWN_HEADING_RAD = math.pi
 
+_Key = tuple[int, int, tuple[float, ...]]
+"""Stamp, order of the kind, content: equal only for equal messages."""
+
 
 @dataclass(slots=True, eq=False)
 class _Record:
     """An event and the filter after it."""
 
-    key: tuple[int, int, tuple[float, ...]]
+    key: _Key
     event: Event
     state: FloatArray
     covariance: FloatArray
@@ -59,7 +62,7 @@ class NavigationFilter:
             config.heading_offset_sigma_rad, config.heading_offset_time_s,
             config.current_sigma_m_s, config.current_time_s,
         ])  # fmt: skip
-        self._waiting: list[tuple[tuple[int, int, tuple[float, ...]], Event]] = []
+        self._early: list[tuple[_Key, Event]] | None = []
         self._records: list[_Record] = []
         self.num_late = 0
         self.num_invalid = 0
@@ -165,7 +168,7 @@ class NavigationFilter:
 
     def start(self) -> None:
         """Begin with what has come so far, even without a yaw."""
-        if not self._records and self._waiting:
+        if not self._records and self._early:
             self._begin()
 
     def _is_valid(self, *values: float) -> bool:
@@ -176,11 +179,8 @@ class NavigationFilter:
 
     def _add(self, stamp_ns: int, event: Event, content: tuple[float, ...]) -> None:
         key = (int(stamp_ns), _ORDER[type(event)], content)
-        if not self._records:
-            bisect.insort(self._waiting, (key, event), key=lambda item: item[0])
-            has_yaw = any(isinstance(item, Yaw) for _, item in self._waiting)
-            if has_yaw or self._waiting[-1][0][0] - self._waiting[0][0][0] > _WAIT_FOR_YAW_NS:
-                self._begin()
+        if self._early is not None:
+            self._add_early(key, event)
             return
         if key[0] < self._records[0].key[0]:
             self.num_late += 1
@@ -194,9 +194,26 @@ class NavigationFilter:
             self._apply(old_key, old_event)
         self._forget()
 
+    def _add_early(self, key: _Key, event: Event) -> None:
+        """Near the start everything is kept, since a late message may change how it began."""
+        early = self._early
+        assert early is not None
+        bisect.insort(early, (key, event), key=lambda item: item[0])
+        span_ns = early[-1][0][0] - early[0][0][0]
+        if self._records and early[-1][0] == key and early[-1][1] is event:
+            self._apply(key, event)
+        elif (
+            self._records
+            or span_ns > _WAIT_FOR_YAW_NS
+            or any(isinstance(e, Yaw) for _, e in early)
+        ):
+            self._begin()
+        if self._records and span_ns > self._config.horizon_s * 1e9:
+            self._early = None
+
     def _begin(self) -> None:
         config = self._config
-        waiting, self._waiting = self._waiting, []
+        waiting = self._early or []
         first_yaw = next((event for _, event in waiting if isinstance(event, Yaw)), None)
         state = np.zeros(NUM_STATES)
         state[2] = state[13] = first_yaw.yaw_rad if first_yaw is not None else 0.0
@@ -224,7 +241,7 @@ class NavigationFilter:
             if event is not first_yaw:
                 self._apply(key, event)
 
-    def _apply(self, key: tuple[int, int, tuple[float, ...]], event: Event) -> None:
+    def _apply(self, key: _Key, event: Event) -> None:
         before = self._records[-1]
         state, covariance = self._predicted(before, key[0])
         refused = before.refused_since_ns

@@ -37,7 +37,7 @@ class SonarConfig(Config):
         0.0, 0.0, 1.0, "adaptive and CFAR: share of full scale below which nothing is an echo"
     )
     adaptive_factor: float = setting(
-        4.0, 0.5, 50.0, "adaptive: deviations above the mean of the same range over all beams"
+        4.0, 0.5, 50.0, "adaptive: spreads above the median of the same range over all beams"
     )
     false_alarm_rate: float = setting(
         1e-4, 1e-12, 0.1, "CFAR: designed false alarms per cell of pure noise"
