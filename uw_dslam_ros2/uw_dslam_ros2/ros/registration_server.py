@@ -23,7 +23,7 @@ from uw_dslam_msgs.action import RegisterMaps as RegisterMapsAction
 from uw_dslam_msgs.srv import RegisterMaps, RegisterPointSets
 
 from uw_dslam_ros2.core.config import Config, setting
-from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.errors import ConfigError, InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration import (
     GridRegistrationConfig,
@@ -173,7 +173,7 @@ class RegistrationServer(Node):
         source = self._map_of(request.source, "source")
         target = self._map_of(request.target, "target")
         prior, max_seconds = options_from_msg(request.options)
-        config = limited(self._grid_config, max_seconds)
+        config = adapted(self._grid_config, max_seconds)
         return functools.partial(
             register_grids, source, target, config, prior=prior, clock=time.monotonic
         )
@@ -191,21 +191,12 @@ class RegistrationServer(Node):
         prior, max_seconds = options_from_msg(request.options)
         source = self._points_of(request.source, "source")
         target = self._points_of(request.target, "target")
-        if not (np.isfinite(request.sigma_m) and request.sigma_m >= 0.0):
-            raise InvalidInputError(
-                f"sigma_m is {request.sigma_m} m, expected 0 (derived) or a positive number"
-            )
-        config = limited(self._point_config, max_seconds)
-        sigma_m = float(request.sigma_m) or None
+        given: dict[str, float] = {}
+        if request.sigma_m != 0.0:
+            given["sigma_m"] = float(request.sigma_m)
+        config = adapted(self._point_config, max_seconds, **given)
         return functools.partial(
-            register_point_sets,
-            source,
-            target,
-            config,
-            source_sigma_m=sigma_m,
-            target_sigma_m=sigma_m,
-            prior=prior,
-            clock=time.monotonic,
+            register_point_sets, source, target, config, prior=prior, clock=time.monotonic
         )
 
     def _points_of(self, msgs: Sequence[Any], name: str) -> NDArray[np.float64]:
@@ -272,11 +263,20 @@ class RegistrationServer(Node):
         return not is_full, text, values
 
 
-def limited[ConfigT: Config](config: ConfigT, max_seconds: float) -> ConfigT:
-    """Settings with the caller's time limit; 0 keeps the server's."""
-    if max_seconds == 0.0:
-        return config
-    return type(config).from_dict({**config.to_dict(), "max_seconds": max_seconds})
+def adapted[ConfigT: Config](config: ConfigT, max_seconds: float, **given: float) -> ConfigT:
+    """Settings with what the caller asks; a time limit of 0 keeps the server's.
+
+    Raises
+    ------
+    InvalidInputError
+        If what is asked is outside the setting's range.
+    """
+    if max_seconds != 0.0:
+        given["max_seconds"] = max_seconds
+    try:
+        return type(config).from_dict({**config.to_dict(), **given})
+    except ConfigError as error:
+        raise InvalidInputError(f"the request asks for what cannot be: {error}") from error
 
 
 def _feedback(progress: Progress, seconds: float) -> RegisterMapsAction.Feedback:
