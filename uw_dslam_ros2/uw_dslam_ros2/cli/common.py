@@ -1,0 +1,84 @@
+"""What all commands share: how errors are told, progress bars, versions."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from tqdm import tqdm
+
+import uw_dslam_ros2
+from uw_dslam_ros2.core.errors import UwDslamError
+
+__all__ = ["EXIT_BAD_INPUT", "Progress", "parser_for", "progress_bar", "run_command", "versions"]
+
+EXIT_BAD_INPUT = 2
+"""Exit code for wrong usage, files and settings; argparse uses the same."""
+_EXIT_INTERRUPTED = 130
+_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "scikit-learn", "gtsam")
+
+
+def parser_for(name: str, description: str, example: str) -> argparse.ArgumentParser:
+    """Make a parser whose help text ends with an example."""
+    return argparse.ArgumentParser(
+        prog=name,
+        description=description,
+        epilog=f"Example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def run_command(name: str, command: Callable[[], int]) -> int:
+    """Run a command; what a person can mend is told in one line on stderr, with exit code 2."""
+    try:
+        return command()
+    except UwDslamError as error:
+        print(f"{name}: error: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
+        return _EXIT_INTERRUPTED
+
+
+class Progress(Protocol):
+    """A bar that is told where it stands."""
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that `done` of `total` parts are done."""
+
+
+@contextmanager
+def progress_bar(title: str, unit: str) -> Iterator[Progress]:
+    """Show a bar on a terminal; elsewhere nothing."""
+    with tqdm(
+        desc=title, unit=unit, disable=not sys.stderr.isatty(), leave=False, dynamic_ncols=True
+    ) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.n = done
+            bar.refresh()
+
+        yield show
+
+
+def num_processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes."""
+    found = {"uw_dslam_ros2": uw_dslam_ros2.__version__, "python": platform.python_version()}
+    for library in _LIBRARIES:
+        try:
+            found[library] = importlib.metadata.version(library)
+        except importlib.metadata.PackageNotFoundError:  # an installed ROS names some differently
+            found[library] = "unknown"
+    return found

@@ -1,0 +1,352 @@
+"""``./uw demo``: recordings through the real nodes to one map and a report."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import uw_dslam_ros2
+from uw_dslam_ros2.cli.common import (
+    num_processors,
+    parser_for,
+    progress_bar,
+    run_command,
+    versions,
+)
+from uw_dslam_ros2.cli.mapping import OfflineConfig
+from uw_dslam_ros2.cli.outcome import outcome_of
+from uw_dslam_ros2.cli.processes import Child, Children, free_domain
+from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
+from uw_dslam_ros2.cli.scoring import Scores, Truth, read_truth
+from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.merging import MapQueueConfig
+from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
+from uw_dslam_ros2.io.session import load_session
+from uw_dslam_ros2.io.settings import SettingsFile
+from uw_dslam_ros2.sim.mission import MissionConfig
+from uw_dslam_ros2.sim.recording import simulate_mission
+
+__all__ = ["main"]
+
+_MARK = ".uw_demo"
+_NUM_STEPS = 6
+_START_TIMEOUT_S = 90.0
+_FINISH_TIMEOUT_S = 300.0
+_SETTLE_TIMEOUT_S = 600.0
+# As fast as the mappers keep up: the player holds when one is this far behind, in recorded time.
+_UNLIMITED_RATE = 10_000.0
+_MAX_LAG_S = 4.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the demo; exit code 0 also where some vehicles could not be merged."""
+    args = _parser().parse_args(argv)
+    # A demo that is told to end ends its processes too.
+    signal.signal(signal.SIGTERM, _interrupt)
+    return run_command("demo", lambda: _run(args))
+
+
+def _interrupt(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = parser_for(
+        "./uw demo",
+        "Simulate vehicles in a harbour (or convert a public recording), replay the recordings\n"
+        "through the real nodes in separate processes, and write the merged map and a report.",
+        "./uw demo --out my_demo --seed 7",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("uw_demo"), metavar="DIR", help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=MissionConfig().seed, help="another place for each"
+    )
+    parser.add_argument("--vehicles", type=int, default=3, metavar="N", help="default: 3")
+    parser.add_argument(
+        "--duration",
+        type=float,
+        default=MissionConfig().duration_s,
+        metavar="S",
+        help="length of each recording [s] (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--rate",
+        type=float,
+        metavar="R",
+        help="recorded seconds per second (default: as fast as the mappers keep up)",
+    )
+    parser.add_argument(
+        "--dataset", choices=("aracati2017",), help="a real recording, not a simulated one"
+    )
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the dataset")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings of the nodes (YAML)")
+    return parser
+
+
+@dataclass(slots=True)
+class _Steps:
+    """Says what is being done and how long it took."""
+
+    times_s: dict[str, float] = field(default_factory=dict)
+    _begun_s: float = field(default_factory=time.monotonic)
+    _last: str = ""
+
+    def begin(self, name: str, text: str) -> None:
+        self.end()
+        self._last, self._begun_s = name, time.monotonic()
+        print(f"[demo] {len(self.times_s) + 1}/{_NUM_STEPS} {text}", flush=True)
+
+    def end(self) -> None:
+        if self._last:
+            self.times_s[self._last] = time.monotonic() - self._begun_s
+            self._last = ""
+
+    def say(self, text: str) -> None:
+        print(f"[demo]     {text}", flush=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Recordings:
+    """What is replayed."""
+
+    title: str
+    vehicles: tuple[str, ...]
+    bags: tuple[Path, ...]
+    truth: Truth
+    ping_topic: str
+    config: Path | None
+    seeds: dict[str, int]
+
+
+def _run(args: argparse.Namespace) -> int:
+    if args.dataset and not args.data:
+        raise DataError(f"--dataset {args.dataset} needs --data, the folder of its files")
+    SettingsFile(args.config)  # a wrong file is told before anything is simulated
+    out = _prepared(args.out)
+    steps = _Steps()
+    started_s = time.monotonic()
+    recordings = _convert(args, out, steps) if args.dataset else _simulate(args, out, steps)
+    notes = _replay(args, out, recordings, steps)
+    steps.begin("writing the report", "writing maps, pictures and report")
+    outcome = outcome_of(load_session(out / "session", _queue_config(recordings)))
+    steps.end()
+    facts = RunFacts(
+        title=recordings.title,
+        source=[bag.name for bag in recordings.bags],
+        command="./uw demo " + " ".join(sys.argv[1:]),
+        settings=OfflineConfig.read(recordings.config, recordings.vehicles).to_dict(),
+        seeds=recordings.seeds,
+        versions=versions(),
+        times_s=steps.times_s | {"all": time.monotonic() - started_s},
+        notes=notes,
+    )
+    scores = write_report(out, outcome, facts, recordings.truth)
+    _conclude(out, headline(outcome, scores), scores, time.monotonic() - started_s)
+    return 0
+
+
+def _conclude(out: Path, text: str, scores: Scores, seconds: float) -> None:
+    if scores.alone_rmse_m and scores.trajectory is not None:
+        alone = ", ".join(f"{name} {error:.2f} m" for name, error in scores.alone_rmse_m.items())
+        print(f"[demo] own drift of each vehicle before merging: {alone}")
+    print(f"[demo] done in {seconds:.0f} s: {text}")
+    print(f"[demo] look at {out / 'report.html'} and {out / 'before_after.png'}")
+    print(f"[demo] numbers in {out / 'report.json'}, the map in {out / 'global_map.yaml'}")
+
+
+def _prepared(out: Path) -> Path:
+    """Make an empty folder; an earlier demo's is replaced, anything else is left alone."""
+    out = out.resolve()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        if not (out / _MARK).is_file():
+            raise DataError(
+                f"{out} holds other files than a demo's; give another --out or remove it"
+            )
+        shutil.rmtree(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / _MARK).write_text("The next ./uw demo with this folder replaces it.\n")
+    except OSError as error:
+        raise DataError(f"cannot write to {out}: {error.strerror}") from error
+    return out
+
+
+# --- recordings ------------------------------------------------------------------------------
+
+
+def _simulate(args: argparse.Namespace, out: Path, steps: _Steps) -> _Recordings:
+    config = MissionConfig(
+        seed=args.seed, num_vehicles=args.vehicles, duration_s=float(args.duration)
+    )
+    steps.begin(
+        "simulating",
+        f"simulating a {config.place} (seed {config.seed}) and {config.num_vehicles} vehicles, "
+        f"{config.duration_s:.0f} s of recordings each",
+    )
+    with progress_bar("simulating", " pings") as progress:
+        mission = simulate_mission(
+            out / "recordings", config, num_processes=num_processors(), progress=progress
+        )
+    num_bytes = sum(f.stat().st_size for bag in mission.bags for f in bag.iterdir())
+    steps.say(f"{len(mission.bags)} bags, {num_bytes / 1e6:.0f} MB")
+    return _Recordings(
+        f"Simulated {config.place}, seed {config.seed}: {config.num_vehicles} vehicles",
+        mission.vehicle_ids,
+        mission.bags,
+        read_truth(mission.truth_map.parent),
+        "sonar",
+        args.config,
+        {"mission": config.seed},
+    )
+
+
+def _convert(args: argparse.Namespace, out: Path, steps: _Steps) -> _Recordings:
+    steps.begin("converting", f"converting {args.dataset} to bags")
+    with progress_bar("converting", " bags") as progress:
+        bags = write_bags(read_aracati2017(args.data), out / "recordings", progress=progress)
+    chosen = [bag for bag in bags if bag.name.startswith("auv_") and bag.parent.name != "whole"]
+    return _Recordings(
+        "Aracati 2017: one recording as three vehicles",
+        tuple(bag.name for bag in chosen),
+        tuple(chosen),
+        read_truth(out / "recordings" / "truth"),
+        "points",
+        args.config or _config_file("aracati2017.yaml"),
+        {},
+    )
+
+
+def _config_file(name: str) -> Path:
+    """Find a settings file of ours: in the checkout, or where colcon installed it."""
+    folders = [Path(uw_dslam_ros2.__file__).resolve().parents[2] / "config"]
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(":")
+    folders += [Path(prefix) / "share" / "uw_dslam_ros2" / "config" for prefix in prefixes]
+    found = [folder / name for folder in folders if (folder / name).is_file()]
+    if not found:
+        raise DataError(f"the settings file {name} is in none of {', '.join(map(str, folders))}")
+    return found[0]
+
+
+# --- nodes -----------------------------------------------------------------------------------
+
+
+def _replay(
+    args: argparse.Namespace, out: Path, recordings: _Recordings, steps: _Steps
+) -> list[str]:
+    """Everything from the start of the nodes to the saved session; returns what went wrong."""
+    # Only here, so that help and wrong usage are told at once and without ROS.
+    from uw_dslam_ros2.ros.mission_control import MissionControl  # noqa: TID251 (it runs nodes)
+
+    domain_id, claim = free_domain()
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_LOG_DIR": str(out / "logs" / "ros"),
+        "PYTHONUNBUFFERED": "1",
+        # Many processes share the cores; each one's own pool of threads would only be in the way.
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+    with claim, Children(environment, out / "logs") as children:
+        steps.begin("starting the nodes", f"starting the nodes on ROS domain {domain_id}")
+        _start_nodes(children, recordings)
+        with MissionControl(domain_id, children.check) as control:
+            control.wait_for_nodes(recordings.vehicles, _START_TIMEOUT_S)
+            steps.begin("replaying", "replaying the bags, as fast as the mappers keep up")
+            player = _start_player(children, args.rate, recordings)
+            _follow(control, player, children.check)
+            control.finish_mappers(recordings.vehicles, _FINISH_TIMEOUT_S)
+            steps.begin("registering", "waiting for the last registrations")
+            is_settled = _settle(control, steps)
+            steps.begin("saving", "saving through the manager's services")
+            problem = control.save_map(str(out / "global_map"))
+            control.save_session(str(out / "session"))
+    notes = [f"The manager saved no map: {problem}."] if problem else []
+    if not is_settled:
+        notes.append(
+            f"The queue was still registering after {_SETTLE_TIMEOUT_S:.0f} s; "
+            "this is what was merged by then."
+        )
+    return notes
+
+
+def _start_nodes(children: Children, recordings: _Recordings) -> None:
+    ros = ["--ros-args"]
+    if recordings.config is not None:
+        ros += ["--params-file", str(recordings.config.resolve())]
+    for vehicle in recordings.vehicles:
+        parameters = ["-r", f"__ns:=/{vehicle}", "-p", "use_sim_time:=true"]
+        parameters += ["-p", "is_reliable:=true"]
+        children.start(
+            f"{vehicle}_sonar_mapper", "uw_dslam_ros2.ros.sonar_mapper", [*ros, *parameters]
+        )
+    children.start("registration_server", "uw_dslam_ros2.ros.registration_server", ros)
+    parameters = ["-p", "use_sim_time:=true"]
+    children.start("map_queue_manager", "uw_dslam_ros2.ros.map_queue_manager", [*ros, *parameters])
+
+
+def _start_player(children: Children, rate: float | None, recordings: _Recordings) -> Child:
+    topics = [f"/{vehicle}/{recordings.ping_topic}" for vehicle in recordings.vehicles]
+    arguments = [str(bag) for bag in recordings.bags]
+    arguments += ["--rate", str(rate or _UNLIMITED_RATE), "--max-lag-s", str(_MAX_LAG_S)]
+    arguments += ["--wait-for", *topics]
+    return children.start("bag_player", "uw_dslam_ros2.ros.bag_player", arguments, may_end=True)
+
+
+def _follow(control: Any, player: Child, check: Callable[[], None]) -> None:
+    """Wait until all is played."""
+    shown = ""
+    while player.poll() is None:
+        check()
+        control.spin()
+        status = control.status
+        text = (
+            "" if status is None else f"{len(status.submaps)} submaps, {status.num_merged} merged"
+        )
+        if text != shown and sys.stderr.isatty():
+            print(f"\r[demo]     {text}\x1b[K", end="", file=sys.stderr, flush=True)
+            shown = text
+    if shown:
+        print("\r\x1b[K", end="", file=sys.stderr)
+    check()
+
+
+def _settle(control: Any, steps: _Steps) -> bool:
+    shown = [""]
+
+    def show(status: Any) -> None:
+        text = (
+            f"{len(status.submaps)} submaps, {status.num_merged} merged, "
+            f"{status.num_registrations} registrations"
+        )
+        if text != shown[0] and sys.stderr.isatty():
+            print(f"\r[demo]     {text}\x1b[K", end="", file=sys.stderr, flush=True)
+        shown[0] = text
+
+    is_settled = bool(control.wait_until_settled(_SETTLE_TIMEOUT_S, show))
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr)
+    steps.say(shown[0])
+    return is_settled
+
+
+# --- results ---------------------------------------------------------------------------------
+
+
+def _queue_config(recordings: _Recordings) -> MapQueueConfig:
+    return SettingsFile(recordings.config).section(MapQueueConfig, "queue", "/map_queue_manager")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,297 @@
+"""What came out of a mapping run: the one form that offline, demo, pictures and report share."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
+from uw_dslam_ros2.core.merging import Constraint, MapQueue, SubmapRecord, SubmapState
+from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io.atomic import write_files
+from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum
+
+__all__ = ["Outcome", "RegistrationRow", "VehicleOutcome", "outcome_of", "write_outcome"]
+
+FloatArray = NDArray[np.float64]
+Trajectory = tuple[NDArray[np.int64], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationRow:
+    """One registration as it is listed; lengths in metres, angles in radians, NaN: not known."""
+
+    number: int
+    source: str
+    target: str
+    verdict: str
+    reason: str
+    is_used: bool
+    x: float
+    y: float
+    yaw: float
+    sigma_x: float
+    sigma_y: float
+    sigma_yaw: float
+    probability: float
+    score: float
+    lower_bound: float
+    upper_bound: float
+    gap: float
+    is_certified: bool
+    num_boxes: int
+    overlap: float
+    conflict_ratio: float
+    inlier_ratio: float
+    num_source_points: int
+    num_target_points: int
+    has_prior: bool
+
+    @classmethod
+    def of(cls, number: int, answer: Answer, is_used: bool) -> RegistrationRow:
+        """Flatten an answer."""
+        motion, numbers = answer.T_target_source, answer.numbers
+        sigma_x, sigma_y, sigma_yaw = np.sqrt(np.maximum(np.diag(answer.covariance), 0.0))
+        upper = numbers.get("upper_bound", math.nan)
+        lower = numbers.get("lower_bound", math.nan)
+        return cls(
+            number,
+            names_of(answer.match.source.ids),
+            names_of(answer.match.target.ids),
+            answer.verdict.name,
+            answer.reason,
+            is_used,
+            motion.x,
+            motion.y,
+            motion.yaw,
+            float(sigma_x),
+            float(sigma_y),
+            float(sigma_yaw),
+            float(answer.probability),
+            numbers.get("score", math.nan),
+            lower,
+            upper,
+            (upper - lower) / upper if upper > 0.0 else math.nan,
+            bool(numbers.get("is_certified", False)),
+            int(numbers.get("num_boxes", 0)),
+            numbers.get("overlap", math.nan),
+            numbers.get("conflict_ratio", math.nan),
+            numbers.get("inlier_ratio", math.nan),
+            int(numbers.get("num_source_points", 0)),
+            int(numbers.get("num_target_points", 0)),
+            answer.match.prior is not None,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VehicleOutcome:
+    """One vehicle: what it made alone, and where that lies in the global map (None: nowhere)."""
+
+    vehicle_id: str
+    own_map: OccupancyMap
+    own_trajectory: Trajectory
+    trajectory: Trajectory | None
+    num_submaps: int
+    num_merged: int
+    reason: str
+
+    @property
+    def is_merged(self) -> bool:
+        """Whether any of it is in the global map."""
+        return self.num_merged > 0
+
+    def path_length_m(self) -> float:
+        """Way travelled."""
+        return float(np.hypot(*np.diff(self.own_trajectory[1][:, :2], axis=0).T).sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """Everything that a run found out; no clock and no file in it."""
+
+    vehicles: tuple[VehicleOutcome, ...]
+    records: tuple[SubmapRecord, ...]
+    constraints: tuple[Constraint, ...]
+    global_map: OccupancyMap | None
+    registrations: tuple[RegistrationRow, ...]
+
+    @property
+    def num_merged_vehicles(self) -> int:
+        """Vehicles with a place in the global map."""
+        return sum(vehicle.is_merged for vehicle in self.vehicles)
+
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Of the merged vehicles, in the global frame."""
+        return {v.vehicle_id: v.trajectory for v in self.vehicles if v.trajectory is not None}
+
+    def verdict_counts(self) -> dict[str, int]:
+        """How many registrations ended how, by name."""
+        verdicts = [row.verdict for row in self.registrations]
+        return {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))}
+
+
+def names_of(ids: Iterable[SubmapId]) -> str:
+    """Submaps as text: ``auv_1/0-3`` for four of one vehicle."""
+    by_vehicle: dict[str, list[int]] = {}
+    for vehicle, sequence in ids:
+        by_vehicle.setdefault(vehicle, []).append(sequence)
+    return " + ".join(f"{v}/{_ranges(sorted(s))}" for v, s in sorted(by_vehicle.items()))
+
+
+def _ranges(numbers: list[int]) -> str:
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1].append(number)
+        else:
+            parts.append([number])
+    return ",".join(str(p[0]) if len(p) == 1 else f"{p[0]}-{p[-1]}" for p in parts)
+
+
+def outcome_of(queue: MapQueue) -> Outcome:
+    """Take everything out of a queue that has settled."""
+    records = queue.submaps()
+    trajectories = queue.trajectories()
+    vehicles = []
+    for vehicle_id in sorted({record.submap.vehicle_id for record in records}):
+        own = [record for record in records if record.submap.vehicle_id == vehicle_id]
+        own_map, own_trajectory = _alone([record.submap for record in own])
+        merged = [record for record in own if record.state is SubmapState.MERGED]
+        others = [record for record in own if record.state is not SubmapState.MERGED]
+        vehicles.append(
+            VehicleOutcome(
+                vehicle_id,
+                own_map,
+                own_trajectory,
+                trajectories.get(vehicle_id) if merged else None,
+                len(own),
+                len(merged),
+                (others or merged)[0].reason,
+            )
+        )
+    evidence = queue.global_map()
+    return Outcome(
+        tuple(vehicles),
+        tuple(records),
+        tuple(queue.constraints()),
+        None if evidence is None else evidence.to_occupancy(),
+        tuple(
+            RegistrationRow.of(number, answer, is_used)
+            for number, (answer, is_used) in enumerate(queue.answers(), start=1)
+        ),
+    )
+
+
+def _alone(submaps: list[Submap]) -> tuple[OccupancyMap, Trajectory]:
+    """One vehicle's map and trajectory without any other, in the frame of its first submap."""
+    queue = MapQueue()
+    for submap in submaps:
+        queue.add_submap(submap)
+    evidence = queue.global_map()
+    assert evidence is not None  # it holds at least the first submap
+    stamps_poses = queue.trajectories().get(submaps[0].vehicle_id)
+    if stamps_poses is None:
+        stamps_poses = np.empty(0, np.int64), np.empty((0, 3))
+    return evidence.to_occupancy(), stamps_poses
+
+
+def write_outcome(folder: Path, outcome: Outcome) -> None:
+    """Write maps, submaps, trajectories, pose graph and registrations; same input, same bytes.
+
+    ``global_map.*``, ``vehicle_maps/<vehicle>.*``, ``submaps/<vehicle>_<sequence>.*`` and
+    ``submaps/submaps.json``, ``trajectories/<vehicle>.tum`` (global frame) and
+    ``trajectories/<vehicle>_alone.tum``, ``pose_graph.g2o``, ``registrations.json`` and ``.csv``.
+    """
+    if outcome.global_map is not None:
+        write_map(folder / "global_map", outcome.global_map)
+    for vehicle in outcome.vehicles:
+        name = vehicle.vehicle_id
+        write_map(folder / "vehicle_maps" / name, vehicle.own_map)
+        write_tum(folder / "trajectories" / f"{name}_alone.tum", *vehicle.own_trajectory)
+        if vehicle.trajectory is not None:
+            write_tum(folder / "trajectories" / f"{name}.tum", *vehicle.trajectory)
+    for record in outcome.records:
+        submap = record.submap
+        write_map(folder / "submaps" / f"{submap.vehicle_id}_{submap.sequence}", submap.grid)
+    rows = [_strict(asdict(row)) for row in outcome.registrations]
+    write_files(
+        {
+            folder / "submaps" / "submaps.json": json_bytes(_submap_table(outcome)),
+            folder / "registrations.json": json_bytes(rows),
+            folder / "registrations.csv": _csv_bytes(rows),
+        }
+    )
+    _write_graph(folder / "pose_graph.g2o", outcome)
+
+
+def json_bytes(content: Any) -> bytes:
+    """Indented JSON that every reader takes: NaN becomes null."""
+    return (json.dumps(_strict(content), indent=1, allow_nan=False) + "\n").encode()
+
+
+def _strict(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _strict(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(inner) for inner in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _csv_bytes(rows: list[dict[str, Any]]) -> bytes:
+    text = io.StringIO()
+    names = [field.name for field in fields(RegistrationRow)]
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+def _submap_table(outcome: Outcome) -> list[dict[str, Any]]:
+    return [
+        {
+            "vehicle_id": record.submap.vehicle_id,
+            "sequence": record.submap.sequence,
+            "revision": record.submap.revision,
+            "state": record.state.name,
+            "component": record.component,
+            "T_component_submap": record.T_component_submap.as_array().tolist(),
+            "num_tries": record.num_tries,
+            "reason": record.reason,
+        }
+        for record in outcome.records
+    ]
+
+
+def _write_graph(path: Path, outcome: Outcome) -> None:
+    """Vertices are numbered as in submaps.json; only what shares the global frame is in it."""
+    numbers = {record.submap.submap_id: i for i, record in enumerate(outcome.records)}
+    vertices: dict[int, SE2] = {
+        numbers[record.submap.submap_id]: record.T_component_submap
+        for record in outcome.records
+        if record.state is SubmapState.MERGED
+    }
+    edges = [
+        PoseGraphEdge(numbers[c.target], numbers[c.source], c.T_target_source, _regular(c))
+        for c in outcome.constraints
+        if c.is_inlier and numbers[c.source] in vertices and numbers[c.target] in vertices
+    ]
+    write_g2o(path, vertices, edges)
+
+
+def _regular(constraint: Constraint) -> FloatArray:
+    """Odometry may claim to be perfect; a g2o file needs an inverse."""
+    return constraint.covariance + np.diag([1e-6, 1e-6, 1e-8])

@@ -1,0 +1,384 @@
+"""Pictures of maps and trajectories, for reports."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.transforms import Affine2D
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.cli.outcome import Outcome, Trajectory
+from uw_dslam_ros2.cli.scoring import Scores, Truth
+from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging import SubmapState
+from uw_dslam_ros2.core.metrics import interpolate_poses, resample
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = [
+    "before_after",
+    "error_plot",
+    "overlay",
+    "png_bytes",
+    "truth_comparison",
+    "vehicle_colors",
+]
+
+FloatArray = NDArray[np.float64]
+
+# Okabe and Ito's colours, which people with any colour vision tell apart.
+_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_WALL, _FREE, _UNKNOWN = (0.08, 0.08, 0.10), (1.0, 1.0, 1.0), (0.80, 0.82, 0.84)
+_AGREE, _EXTRA, _MISSING = (0.10, 0.10, 0.12), (0.835, 0.369, 0.0), (0.0, 0.447, 0.698)
+_INK = "#1c2733"
+_MAX_PIXELS = 1600
+_MARGIN_CELLS = 12
+
+
+def vehicle_colors(vehicles: Sequence[str]) -> dict[str, str]:
+    """One colour for each vehicle."""
+    return {name: _COLORS[i % len(_COLORS)] for i, name in enumerate(sorted(vehicles))}
+
+
+def png_bytes(figure: Figure, dpi: int = 110) -> bytes:
+    """Encode a figure; the same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    # Pictures of maps have few colours: a palette makes them a third of the size.
+    pixels = cv2.imdecode(np.frombuffer(buffer.getvalue(), np.uint8), cv2.IMREAD_COLOR)
+    is_done, encoded = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    assert is_done
+    return encoded.tobytes()
+
+
+def before_after(outcome: Outcome, title: str) -> Figure:
+    """Each vehicle's map by itself, and the one map of all, with ways and seams."""
+    colors = vehicle_colors([v.vehicle_id for v in outcome.vehicles])
+    num = len(outcome.vehicles)
+    figure = _figure(14.0, max(7.0, 2.9 * num))
+    outer = figure.add_gridspec(
+        1, 2, width_ratios=(1.0, 2.3), left=0.015, right=0.985, top=0.90, bottom=0.06, wspace=0.05
+    )
+    inner = outer[0].subgridspec(num, 1, hspace=0.16)
+    for index, vehicle in enumerate(outcome.vehicles):
+        axes = figure.add_subplot(inner[index])
+        _show_map(axes, vehicle.own_map, crop=True)
+        _draw_way(axes, vehicle.own_trajectory, colors[vehicle.vehicle_id])
+        _scale_bar(axes)
+        state = "" if vehicle.is_merged else "  (not merged)"
+        axes.set_title(
+            f"{vehicle.vehicle_id} alone{state}", fontsize=10, loc="left", color=_INK, pad=4
+        )
+    axes = figure.add_subplot(outer[1])
+    _show_merged(axes, outcome, colors)
+    figure.suptitle(title, x=0.015, y=0.975, ha="left", fontsize=15, color=_INK, weight="bold")
+    return figure
+
+
+def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str]) -> None:
+    merged = [v for v in outcome.vehicles if v.is_merged]
+    axes.set_title(
+        f"One map: {len(merged)} of {len(outcome.vehicles)} vehicles merged",
+        fontsize=10,
+        loc="left",
+        color=_INK,
+        pad=4,
+    )
+    if outcome.global_map is None:
+        axes.text(0.5, 0.5, "nothing was merged", ha="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return
+    _show_map(axes, outcome.global_map, crop=True)
+    for record in outcome.records:
+        if record.state is SubmapState.MERGED:
+            _draw_seam(
+                axes,
+                record.submap.grid,
+                record.T_component_submap,
+                colors[record.submap.vehicle_id],
+            )
+    handles: list[Any] = []
+    for vehicle in merged:
+        if vehicle.trajectory is not None:
+            color = colors[vehicle.vehicle_id]
+            _draw_way(axes, vehicle.trajectory, color)
+            handles.append(Line2D([], [], color=color, lw=2, label=vehicle.vehicle_id))
+    handles += [
+        Line2D([], [], color="#555555", lw=1, ls=(0, (1, 1.5)), label="seam of a submap"),
+        *_shade_handles(),
+    ]
+    _scale_bar(axes)
+    _legend_below(axes, handles)
+
+
+def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure | None:
+    """Walls of the merged map over the true ones: what agrees, is missing, is too much."""
+    if truth.map is None or outcome.global_map is None or scores.trajectory is None:
+        return None
+    spec = _common_spec(truth.map, outcome.global_map, scores.trajectory.T_truth_map)
+    found = resample(outcome.global_map, spec, scores.trajectory.T_truth_map)
+    true = resample(truth.map, spec)
+    tolerance_cells = 0.25 / spec.resolution_m
+    near_true = _near(true > 50, tolerance_cells)
+    near_found = _near(found > 50, tolerance_cells)
+    picture = np.empty((*spec.shape, 3))
+    picture[:] = _UNKNOWN
+    picture[(found >= 0) | (true >= 0)] = (0.93, 0.94, 0.95)
+    picture[found >= 0] = _FREE
+    picture[(true > 50) & ~near_found] = _MISSING
+    picture[(found > 50) & near_true] = _AGREE
+    picture[(found > 50) & ~near_true] = _EXTRA
+    figure = _figure(10.0, 7.6)
+    axes = figure.add_axes((0.02, 0.09, 0.96, 0.85))
+    _show_picture(axes, picture, spec)
+    _scale_bar(axes)
+    _legend_below(
+        axes,
+        [
+            Patch(color=_AGREE, label="wall, and there is one within 0.25 m"),
+            Patch(color=_EXTRA, label="wall, and there is none"),
+            Patch(color=_MISSING, label="true wall that was missed"),
+        ],
+    )
+    axes.set_title("The merged map against the true one", loc="left", fontsize=11, color=_INK)
+    return figure
+
+
+def error_plot(outcome: Outcome, truth: Truth, scores: Scores) -> Figure | None:
+    """Distance from the true position over time, one line for each vehicle, one common frame."""
+    if scores.trajectory is None:
+        return None
+    colors = vehicle_colors([v.vehicle_id for v in outcome.vehicles])
+    figure = _figure(10.0, 3.2)
+    axes = figure.add_axes((0.07, 0.17, 0.91, 0.72))
+    start_ns = min(int(stamps[0]) for stamps, _ in outcome.trajectories().values())
+    for name, (stamps_ns, poses) in outcome.trajectories().items():
+        if name not in truth.trajectories:
+            continue
+        expected, is_inside = interpolate_poses(truth.trajectories[name], stamps_ns)
+        moved = scores.trajectory.T_truth_map.apply(poses[is_inside, :2])
+        error = np.hypot(*(moved - expected[is_inside, :2]).T)
+        time_s = (stamps_ns[is_inside] - start_ns) * 1e-9
+        axes.plot(time_s, error, color=colors[name], lw=1.6, label=name)
+    axes.set(xlabel="time [s]", ylabel="error [m]", ylim=(0.0, None))
+    axes.set_title("Distance from the true position", loc="left", fontsize=11, color=_INK)
+    axes.grid(color="#e3e7ea", lw=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.99), fontsize=9)
+    return figure
+
+
+def overlay(
+    source: OccupancyMap, target: OccupancyMap, T_target_source: SE2, title: str
+) -> Figure:
+    """Lay a source map on a target map: their walls in two colours, and where both agree."""
+    spec = _common_spec(target, source, T_target_source)
+    found, true = resample(source, spec, T_target_source), resample(target, spec)
+    picture = np.empty((*spec.shape, 3))
+    picture[:] = _UNKNOWN
+    picture[(found >= 0) ^ (true >= 0)] = (0.93, 0.94, 0.95)
+    picture[(found >= 0) & (true >= 0)] = _FREE
+    tolerance_cells = 2.0
+    both = (true > 50) & _near(found > 50, tolerance_cells)
+    both |= (found > 50) & _near(true > 50, tolerance_cells)
+    picture[true > 50] = _MISSING
+    picture[found > 50] = _EXTRA
+    picture[both] = _AGREE
+    figure = _figure(9.0, 7.6)
+    axes = figure.add_axes((0.02, 0.10, 0.96, 0.83))
+    _show_picture(axes, picture, spec)
+    _scale_bar(axes)
+    axes.set_title(title, loc="left", fontsize=11, color=_INK)
+    _legend_below(
+        axes,
+        [
+            Patch(color=_EXTRA, label="walls of the source"),
+            Patch(color=_MISSING, label="walls of the target"),
+            Patch(color=_AGREE, label="walls of both"),
+            Patch(facecolor=_FREE, edgecolor="#999999", label="seen by both"),
+        ],
+    )
+    return figure
+
+
+# --- parts -----------------------------------------------------------------------------------
+
+
+def _figure(width: float, height: float) -> Figure:
+    with mpl.rc_context({"font.family": "DejaVu Sans"}):
+        figure = Figure(figsize=(width, height), facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _show_map(axes: Axes, occupancy: OccupancyMap, *, crop: bool) -> None:
+    values = occupancy.values
+    picture = np.empty((*values.shape, 3))
+    picture[:] = _UNKNOWN
+    # Between free and wall the shade follows the probability.
+    share = np.clip(values, FREE, OCCUPIED)[..., None] / 100.0
+    known = values != UNKNOWN
+    shade = (1.0 - share) * _FREE + share * _WALL
+    picture[known] = shade[known]
+    _show_picture(axes, picture, occupancy.spec, crop=known if crop else None)
+
+
+def _show_picture(
+    axes: Axes, picture: FloatArray, spec: GridSpec, crop: NDArray[np.bool_] | None = None
+) -> None:
+    """Show cells as they lie; thin walls survive the reduction to the screen's pixels."""
+    rows, cols = picture.shape[:2]
+    low, high = np.zeros(2, int), np.array([rows, cols])
+    if crop is not None and crop.any():
+        seen = np.argwhere(crop)
+        low = np.maximum(seen.min(axis=0) - _MARGIN_CELLS, 0)
+        high = np.minimum(seen.max(axis=0) + 1 + _MARGIN_CELLS, high)
+        picture = picture[low[0] : high[0], low[1] : high[1]]
+    factor = max(1, math.ceil(max(picture.shape[:2]) / _MAX_PIXELS))
+    size = np.array(picture.shape[:2])
+    picture = _darkest(picture, factor)
+    resolution = spec.resolution_m
+    extent = (
+        low[1] * resolution,
+        (low[1] + math.ceil(size[1] / factor) * factor) * resolution,
+        low[0] * resolution,
+        (low[0] + math.ceil(size[0] / factor) * factor) * resolution,
+    )
+    origin = spec.T_frame_grid
+    motion = Affine2D().rotate(origin.yaw).translate(origin.x, origin.y)
+    image = axes.imshow(picture, extent=extent, origin="lower", interpolation="nearest")
+    image.set_transform(motion + axes.transData)
+    corners = motion.transform(
+        [[extent[i], extent[j]] for i, j in ((0, 2), (1, 2), (1, 3), (0, 3))]
+    )
+    axes.set_xlim(corners[:, 0].min(), corners[:, 0].max())
+    axes.set_ylim(corners[:, 1].min(), corners[:, 1].max())
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color("#c4cad0")
+
+
+def _darkest(picture: FloatArray, factor: int) -> FloatArray:
+    """Reduce by a whole factor; of each block the darkest cell stays."""
+    if factor == 1:
+        return picture
+    rows, cols = (math.ceil(n / factor) * factor for n in picture.shape[:2])
+    padded = np.empty((rows, cols, 3))
+    padded[:] = _UNKNOWN
+    padded[: picture.shape[0], : picture.shape[1]] = picture
+    blocks = padded.reshape(rows // factor, factor, cols // factor, factor, 3).swapaxes(1, 2)
+    blocks = blocks.reshape(rows // factor, cols // factor, factor * factor, 3)
+    index = blocks.sum(axis=-1).argmin(axis=-1)
+    return np.take_along_axis(blocks, index[..., None, None], axis=2)[:, :, 0]
+
+
+def _draw_way(axes: Axes, trajectory: Trajectory, color: str) -> None:
+    poses = trajectory[1]
+    if len(poses) == 0:
+        return
+    axes.plot(poses[:, 0], poses[:, 1], color="white", lw=3.0, alpha=0.8, solid_capstyle="round")
+    axes.plot(poses[:, 0], poses[:, 1], color=color, lw=1.6, solid_capstyle="round")
+    axes.plot(*poses[0, :2], "o", color=color, mec="white", mew=1.0, ms=7)
+    axes.plot(*poses[-1, :2], "s", color=color, mec="white", mew=1.0, ms=6)
+
+
+def _draw_seam(axes: Axes, grid: OccupancyMap, T_map_submap: SE2, color: str) -> None:
+    factor = max(1, max(grid.spec.shape) // 300)
+    # Opening drops the single beams at the rim of what a submap has seen.
+    known = grid.known[::factor, ::factor].astype(np.uint8)
+    known = cv2.morphologyEx(known, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    contours, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    for contour in contours:
+        if cv2.contourArea(contour) < 0.02 * known.sum():
+            continue
+        cells = contour[:, 0, ::-1] * factor
+        points = T_map_submap.apply(grid.spec.centers_of(np.vstack([cells, cells[:1]])))
+        axes.plot(points[:, 0], points[:, 1], color=color, lw=0.9, ls=(0, (1, 1.8)), alpha=0.75)
+
+
+def _scale_bar(axes: Axes) -> None:
+    """Draw a bar of a round length in the lower left corner."""
+    (x_low, x_high), (y_low, y_high) = axes.get_xlim(), axes.get_ylim()
+    width, height = x_high - x_low, y_high - y_low
+    target = 0.22 * width
+    power = 10.0 ** math.floor(math.log10(target))
+    length = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= target)
+    x, y = x_low + 0.03 * width, y_low + 0.03 * height
+    thick = 0.010 * max(height, 0.6 * width)
+    pad = 1.2 * thick
+    axes.add_patch(
+        Rectangle(
+            (x - pad, y - pad),
+            length + 2 * pad,
+            thick + 7.5 * pad,
+            color="white",
+            alpha=0.85,
+            lw=0,
+            zorder=5,
+        )
+    )
+    axes.add_patch(Rectangle((x, y), length, thick, color=_INK, lw=0, zorder=6))
+    axes.text(
+        x + 0.5 * length,
+        y + 1.6 * thick,
+        f"{length:g} m",
+        ha="center",
+        va="bottom",
+        fontsize=8,
+        color=_INK,
+        zorder=6,
+    )
+    axes.set_xlim(x_low, x_high)
+    axes.set_ylim(y_low, y_high)
+
+
+def _shade_handles() -> list[Patch]:
+    return [
+        Patch(facecolor=_WALL, label="wall"),
+        Patch(facecolor=_FREE, edgecolor="#999999", label="free"),
+        Patch(facecolor=_UNKNOWN, label="unknown"),
+    ]
+
+
+def _legend_below(axes: Axes, handles: list[Any]) -> None:
+    axes.legend(
+        handles=handles,
+        loc="upper left",
+        bbox_to_anchor=(0.0, -0.01),
+        ncols=min(len(handles), 8),
+        frameon=False,
+        fontsize=9,
+        handlelength=1.4,
+        columnspacing=1.4,
+        borderaxespad=0.2,
+    )
+
+
+def _near(walls: NDArray[np.bool_], distance_cells: float) -> NDArray[np.bool_]:
+    reach = max(1, round(distance_cells))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return cv2.dilate(walls.astype(np.uint8), kernel) > 0
+
+
+def _common_spec(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> GridSpec:
+    """Take the target's cells, over all that either map knows."""
+    known = np.argwhere(source.known)
+    cells = target.spec.cells_of(T_target_source.apply(source.spec.centers_of(known)))
+    own = np.argwhere(target.known)
+    every = np.concatenate([cells, own]) if len(own) else cells
+    low, high = every.min(axis=0) - _MARGIN_CELLS, every.max(axis=0) + 1 + _MARGIN_CELLS
+    resolution = target.spec.resolution_m
+    corner = target.spec.T_frame_grid @ SE2(low[1] * resolution, low[0] * resolution)
+    return GridSpec(resolution, int(high[0] - low[0]), int(high[1] - low[1]), corner)

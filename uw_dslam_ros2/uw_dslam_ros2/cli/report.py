@@ -1,0 +1,182 @@
+"""The report of a run: one HTML file with its pictures, and the same numbers as JSON."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from uw_dslam_ros2.cli import pictures
+from uw_dslam_ros2.cli.outcome import Outcome, json_bytes, write_outcome
+from uw_dslam_ros2.cli.scoring import Scores, Truth, score
+from uw_dslam_ros2.core.registration.result import Verdict
+from uw_dslam_ros2.io.atomic import write_files
+
+__all__ = ["RunFacts", "headline", "write_report"]
+
+_MEANING = {
+    Verdict.ACCEPTED: "the transform may be used",
+    Verdict.TOO_FEW_FEATURES: "too little to match in one of the maps",
+    Verdict.NOT_ENOUGH_OVERLAP: "the maps share too little, or no better than chance",
+    Verdict.AMBIGUOUS: "several poses explain the maps about equally well",
+    Verdict.CONTRADICTED: "free space of one map lies on walls of the other",
+    Verdict.BUDGET_EXHAUSTED: "stopped before the proof was complete",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunFacts:
+    """What was run, on what, with which settings; ``times_s`` only where they were measured."""
+
+    title: str
+    source: list[str]
+    command: str
+    settings: dict[str, Any]
+    seeds: dict[str, int]
+    versions: dict[str, str]
+    diagnostics: Mapping[str, Mapping[str, float | int | str]] = field(default_factory=dict)
+    times_s: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def write_report(
+    folder: Path,
+    outcome: Outcome,
+    facts: RunFacts,
+    truth: Truth | None,
+    *,
+    has_pictures: bool = True,
+) -> Scores:
+    """Write the result folder: all of `write_outcome`, report.json, pictures and report.html."""
+    scores = score(
+        outcome.global_map,
+        outcome.trajectories(),
+        {v.vehicle_id: v.own_trajectory for v in outcome.vehicles},
+        truth,
+    )
+    write_outcome(folder, outcome)
+    write_files({folder / "report.json": json_bytes(report_dict(outcome, facts, scores))})
+    if has_pictures:
+        images = _draw(outcome, truth, scores)
+        html = render_html(outcome, facts, scores, images).encode()
+        files = {folder / f"{name}.png": content for name, content in images.items()}
+        write_files({**files, folder / "report.html": html})
+    return scores
+
+
+def report_dict(outcome: Outcome, facts: RunFacts, scores: Scores) -> dict[str, Any]:
+    """Everything in numbers; lengths in metres, angles in radians."""
+    result: dict[str, Any] = {
+        "title": facts.title,
+        "command": facts.command,
+        "source": facts.source,
+        "num_vehicles": len(outcome.vehicles),
+        "num_vehicles_merged": outcome.num_merged_vehicles,
+        "vehicles": [
+            {
+                "vehicle_id": v.vehicle_id,
+                "is_merged": v.is_merged,
+                "num_submaps": v.num_submaps,
+                "num_submaps_merged": v.num_merged,
+                "path_length_m": v.path_length_m(),
+                "reason": v.reason,
+            }
+            for v in outcome.vehicles
+        ],
+        "num_registrations": len(outcome.registrations),
+        "verdicts": outcome.verdict_counts(),
+        "scores": scores.to_dict(),
+        "notes": facts.notes,
+        "seeds": facts.seeds,
+        "versions": facts.versions,
+        "settings": facts.settings,
+        "diagnostics": {name: dict(values) for name, values in facts.diagnostics.items()},
+    }
+    if facts.times_s:
+        result["times_s"] = facts.times_s
+    return result
+
+
+def headline(outcome: Outcome, scores: Scores) -> str:
+    """How good it is, in one sentence or two."""
+    num, merged = len(outcome.vehicles), outcome.num_merged_vehicles
+    left = [v.vehicle_id for v in outcome.vehicles if not v.is_merged]
+    text = f"{merged} of {num} vehicles merged"
+    if left:
+        text += f" (NOT merged: {', '.join(left)})"
+    if scores.trajectory is not None:
+        text += (
+            f"; trajectory error {scores.trajectory.rmse_m:.2f} m RMSE, "
+            f"{math.degrees(scores.trajectory.rmse_rad):.1f} degrees, in one frame"
+        )
+    if scores.map is not None:
+        text += (
+            f"; map against the true one: MSE {scores.map.mse:.4f}, SSIM {scores.map.ssim:.3f}, "
+            f"wall IoU {scores.map.wall_iou_tolerant:.2f} (within 0.25 m)"
+        )
+    if scores.trajectory is None:
+        text += "; no truth to compare with"
+    return text
+
+
+def _draw(outcome: Outcome, truth: Truth | None, scores: Scores) -> dict[str, bytes]:
+    num = len(outcome.vehicles)
+    number = {1: "One map", 2: "Two maps", 3: "Three maps", 4: "Four maps"}.get(num, f"{num} maps")
+    figures = {"before_after": pictures.before_after(outcome, f"{number} before, one map after")}
+    if truth is not None:
+        comparison = pictures.truth_comparison(outcome, truth, scores)
+        errors = pictures.error_plot(outcome, truth, scores)
+        figures |= {} if comparison is None else {"map_against_truth": comparison}
+        figures |= {} if errors is None else {"trajectory_error": errors}
+    return {name: pictures.png_bytes(figure) for name, figure in figures.items()}
+
+
+def render_html(
+    outcome: Outcome, facts: RunFacts, scores: Scores, images: Mapping[str, bytes]
+) -> str:
+    """Fill the template; pictures become data URIs, so that the file stands alone."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("uw_dslam_ros2.cli"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = _number
+    environment.filters["degrees"] = math.degrees
+    colors = pictures.vehicle_colors([v.vehicle_id for v in outcome.vehicles])
+    return environment.get_template("report.html.j2").render(
+        outcome=outcome,
+        facts=facts,
+        scores=scores,
+        headline=headline(outcome, scores),
+        colors=colors,
+        images={
+            name: "data:image/png;base64," + base64.b64encode(content).decode()
+            for name, content in images.items()
+        },
+        meaning={verdict.name: text for verdict, text in _MEANING.items()},
+        settings=sorted(_flat(facts.settings)),
+    )
+
+
+def _number(value: float | int | None, digits: int = 2) -> str:
+    """Show a number, or a dash where there is none."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "–"
+    return f"{value:,}" if isinstance(value, int) else f"{value:.{digits}f}"
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            rows += _flat(value, f"{prefix}{name}.")
+        else:
+            rows.append((f"{prefix}{name}", str(value)))
+    return rows
