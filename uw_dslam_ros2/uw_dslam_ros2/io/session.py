@@ -185,6 +185,7 @@ def _write(connection: sqlite3.Connection, state: QueueState) -> None:
         "lattice": None if state.lattice is None else _spec_to_plain(state.lattice),
         "vehicles": state.vehicles,
         "next_request_id": state.next_request_id,
+        "standing": [[s.hex(), t.hex(), prior] for s, t, prior in sorted(state.standing)],
     }
     for name, value in meta.items():
         row = name, json.dumps(value)
@@ -218,6 +219,10 @@ def _read(connection: sqlite3.Connection) -> QueueState:
         None if lattice is None else _spec_from_plain(lattice),
         tuple(meta["vehicles"]),
         meta["next_request_id"],
+        frozenset(
+            (bytes.fromhex(source), bytes.fromhex(target), tuple(prior))
+            for source, target, prior in meta["standing"]
+        ),
     )
 
 

@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
-from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance
-from uw_dslam_ros2.core.merging.units import StoredSubmap, Unit, shared_area_m2
+from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["Answer", "Match", "MatchKey", "edge_of", "numbers_of"]
+__all__ = ["Answer", "Match", "MatchKey", "numbers_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -83,31 +81,6 @@ def numbers_of(result: RegistrationResult) -> dict[str, float]:
     """Proof and measurements of a result by name, where known; no times, which differ each run."""
     values = {name: float(getattr(result, name)) for name in _NUMBERS}
     return {name: value for name, value in values.items() if math.isfinite(value)}
-
-
-def edge_of(
-    answer: Answer,
-    submaps: dict[SubmapId, StoredSubmap],
-    sigma_floor_m: float,
-    sigma_floor_rad: float,
-) -> Edge:
-    """Turn a match of two units into an edge between the two submaps that share most of it."""
-    source, target = answer.match.source, answer.match.target
-    T_target_source = answer.T_target_source
-    best: tuple[float, SubmapId, SubmapId] | None = None
-    for source_id, T_source_submap in source.T_reference_submap.items():
-        for target_id, T_target_submap in target.T_reference_submap.items():
-            T_between = T_target_submap.inverse() @ T_target_source @ T_source_submap
-            area = shared_area_m2(submaps[source_id], submaps[target_id], T_between)
-            if best is None or area > best[0]:
-                best = area, source_id, target_id
-    assert best is not None
-    _, source_id, target_id = best
-    left = target.T_reference_submap[target_id].inverse()
-    right = source.T_reference_submap[source_id]
-    floor = np.diag([sigma_floor_m**2, sigma_floor_m**2, sigma_floor_rad**2])
-    covariance = compose_covariance(answer.covariance, left, T_target_source, right) + floor
-    return Edge(source_id, target_id, left @ T_target_source @ right, covariance)
 
 
 def _prior_key(prior: PriorWindow | None) -> tuple[float, ...]:

@@ -29,14 +29,23 @@ class MapQueueConfig(Config):
         16_000_000, 1, 2_000_000_000, "largest submap grid taken [cells]"
     )
     max_partners: int = setting(
-        4, 1, 1000, "whole-map searches asked at once per vehicle, most promising first"
+        4, 1, 1000, "vehicles that each vehicle is matched with at first, most promising first"
+    )
+    num_neighbours: int = setting(
+        1, 0, 100, "neighbours on each side that a submap is matched with in a check"
+    )
+    max_checks: int = setting(
+        3, 0, 100, "checks of an accepted match, at different places of the common area"
+    )
+    part_length: int = setting(
+        6, 2, 1000, "consecutive submaps in a part of a vehicle's map that is matched by itself"
+    )
+    max_part_searches: int = setting(
+        4, 1, 1000, "searches between two components by their most promising parts"
     )
     inlier_probability: float = setting(
-        0.999, 0.5, 0.999999, "share of right edges that the chi-square test of an edge keeps"
+        0.99, 0.5, 0.999999, "share of right edges that the chi-square test of an edge keeps"
     )
-    edge_sigma_floor_m: float = setting(
-        0.05, 0.0, 10.0, "least standard deviation believed of a registration [m]"
-    )
-    edge_sigma_floor_rad: float = setting(
-        0.005, 0.0, 1.0, "least standard deviation believed of a registration [rad]"
+    edge_sigma_cells: float = setting(
+        0.25, 0.0, 100.0, "least standard deviation believed of a registration [cells]"
     )

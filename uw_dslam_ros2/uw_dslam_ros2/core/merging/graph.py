@@ -14,7 +14,15 @@ from scipy.stats import chi2
 from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["Edge", "Solution", "compose_covariance", "mahalanobis", "solve_graph"]
+__all__ = [
+    "Edge",
+    "Solution",
+    "compose_covariance",
+    "invert_covariance",
+    "mahalanobis",
+    "residual",
+    "solve_graph",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -49,6 +57,15 @@ def compose_covariance(covariance: FloatArray, left: SE2, middle: SE2, right: SE
     jacobian = np.eye(3)
     jacobian[:2, :2] = left.rotation()
     jacobian[:2, 2] = left.rotation() @ (-arm[1], arm[0])
+    return jacobian @ covariance @ jacobian.T
+
+
+def invert_covariance(covariance: FloatArray, motion: SE2) -> FloatArray:
+    """Covariance of ``motion.inverse()`` when that of `motion` is given."""
+    back = motion.inverse()
+    jacobian = -np.eye(3)
+    jacobian[:2, :2] = -back.rotation()
+    jacobian[:2, 2] = back.rotation() @ (-motion.y, motion.x)
     return jacobian @ covariance @ jacobian.T
 
 
@@ -90,18 +107,27 @@ def solve_graph(
         graph.add(_factor(keys, edge))
     for submap_id, motion in initial.items():
         values.insert(keys[submap_id], gtsam.Pose2(motion.x, motion.y, motion.yaw))
-    if loose:
+    threshold = float(chi2.ppf(inlier_probability, 3))
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    errors = _loose_errors(graph, result, len(loose))
+    if (errors > threshold).any():
+        # They do not all agree: find out which, from the beginning.
         result = _gnc(graph, values, 1 + len(firm), inlier_probability)
-    else:
-        result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        errors = _loose_errors(graph, result, len(loose))
     poses: dict[SubmapId, SE2] = {}
     for submap_id, key in keys.items():
         pose = result.atPose2(key)
         # Far below any accuracy, far above what the order of summation may change.
         poses[submap_id] = SE2(round(pose.x(), 7), round(pose.y(), 7), round(pose.theta(), 9))
-    threshold = float(chi2.ppf(inlier_probability, 3))
-    errors = [2.0 * graph.at(1 + len(firm) + i).error(result) for i in range(len(loose))]
-    return Solution(poses, np.array(errors) <= threshold)
+    return Solution(poses, errors <= threshold)
+
+
+def _loose_errors(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, num_loose: int
+) -> FloatArray:
+    """Squared Mahalanobis distances of the last factors."""
+    first = graph.size() - num_loose
+    return np.array([2.0 * graph.at(first + i).error(values) for i in range(num_loose)])
 
 
 def _gnc(

@@ -1,38 +1,40 @@
 """What is to be asked, and what follows from the answers.
 
-A plan depends on the submaps and the answers alone, and not on the order in which they came: it
-is worked out anew after each change, and what has been answered before is not asked again. So a
-queue that was fed in any order comes to the same map, and one that was interrupted goes on where
-it was.
+A plan depends on the submaps and the answers alone, and not on the order in which they came: it is
+worked out anew after each change, and what has been answered is not asked again. So a queue that
+was fed in any order comes to the same map, and one that was interrupted goes on where it was.
+
+Its steps:
+
+1. Whole maps of two vehicles each, the most promising pairs first, without a guess.
+2. What was accepted is checked: smaller maps of neighbouring submaps from both sides are matched
+   again, each only near where the first match puts it. A match that none of its checks confirms
+   is dropped, and the largest set that agrees goes into the graph.
+3. Vehicles that meet according to the graph, but did not match directly, are matched where they
+   meet.
+4. Components that are still apart are matched as wholes, and by their most promising parts; what
+   is accepted there is checked likewise. This goes on as long as something joins.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
-import networkx as nx
-import numpy as np
-
 from uw_dslam_ros2.core.mapping.submap import SubmapId
-from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, edge_of
+from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
-from uw_dslam_ros2.core.merging.graph import Edge, solve_graph
-from uw_dslam_ros2.core.merging.units import StoredSubmap, Unit
-from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.merging.consistency import Side
+from uw_dslam_ros2.core.merging.descriptors import promise
+from uw_dslam_ros2.core.merging.graph import Edge
+from uw_dslam_ros2.core.merging.library import Library
+from uw_dslam_ros2.core.merging.settling import Component, Joint
+from uw_dslam_ros2.core.merging.units import Unit
+from uw_dslam_ros2.core.merging.verification import Verifier
 
-__all__ = ["Joint", "Plan", "make_plan", "odometry_edges"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Joint:
-    """An accepted registration in the graph."""
-
-    key: MatchKey
-    edge: Edge
-    probability: float
-    is_inlier: bool
+__all__ = ["Plan", "make_plan"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,148 +44,202 @@ class Plan:
     wanted: list[Match]
     joints: list[Joint]
     odometry: list[Edge]
-    components: list[dict[SubmapId, SE2]]
-    """``T_component_submap``; the anchor's component first, then by smallest submap."""
-
-
-def odometry_edges(submaps: Mapping[SubmapId, StoredSubmap]) -> list[Edge]:
-    """Edges between each vehicle's consecutive submaps, the later one as source."""
-    edges: list[Edge] = []
-    ids = sorted(submaps)
-    for before, after in itertools.pairwise(ids):
-        if before[0] != after[0]:
-            continue
-        earlier, later = submaps[before].submap, submaps[after].submap
-        T_before_after = earlier.T_odom_submap.inverse() @ later.T_odom_submap
-        turn = np.eye(3)
-        turn[:2, :2] = earlier.T_odom_submap.rotation().T
-        # Submaps missing in between count as much as the one that is there.
-        covariance = turn @ later.covariance @ turn.T * (after[1] - before[1])
-        edges.append(Edge(after, before, T_before_after, covariance))
-    return edges
+    components: list[Component]
+    """The anchor's first, then by smallest submap."""
 
 
 def make_plan(
-    submaps: Mapping[SubmapId, StoredSubmap],
-    withdrawn: frozenset[SubmapId],
-    anchor: SubmapId,
+    library: Library,
     answers: Mapping[MatchKey, Answer],
+    standing: AbstractSet[MatchKey],
+    anchor: SubmapId,
     config: MapQueueConfig,
 ) -> Plan:
     """Work out the plan.
 
     Parameters
     ----------
-    submaps
-        All that are known. Withdrawn ones still carry their vehicle's odometry.
-    withdrawn
-        Those that are neither matched nor drawn.
-    anchor
-        The submap that the global frame is pinned to.
+    library
+        The submaps.
     answers
         By the key of the question.
+    standing
+        Answers that held in the plan before. They go on to hold where this one has not come to
+        its own: a map that grows is not torn apart while larger questions are being answered.
+    anchor
+        The submap that the global frame is pinned to.
+    config
+        Settings.
     """
-    odometry = odometry_edges(submaps)
-    units = _whole_units(submaps, withdrawn)
-    wanted: list[Match] = []
-    joints: list[Joint] = []
-    vehicles = sorted(units)
-    for index, target in enumerate(vehicles):
-        for source in vehicles[index + 1 :]:
-            match = Match(units[source], units[target])
-            answer = answers.get(match.key)
-            if answer is None:
-                wanted.append(match)
-            elif answer.is_accepted:
-                joints.append(_joint(match.key, answer, submaps, config))
-    joints, components = settle(submaps, anchor, odometry, joints, config)
-    return Plan(wanted, joints, odometry, components)
+    return _Planner(library, answers, standing, anchor, config).run()
 
 
-def settle(
-    submaps: Mapping[SubmapId, StoredSubmap],
-    anchor: SubmapId,
-    odometry: list[Edge],
-    joints: list[Joint],
-    config: MapQueueConfig,
-) -> tuple[list[Joint], list[dict[SubmapId, SE2]]]:
-    """Solve the graph of each connected group, leaving out the edges that disagree."""
-    ordered = sorted(joints, key=lambda joint: joint.key)
-    is_inlier = {joint.key: True for joint in ordered}
-    while True:
-        used = [joint for joint in ordered if is_inlier[joint.key]]
-        groups = _groups(submaps, odometry, [joint.edge for joint in used])
-        groups.sort(key=lambda group: (anchor not in group, min(group)))
-        components, num_dropped = [], 0
-        for group in groups:
-            firm = [edge for edge in odometry if edge.source in group]
-            here = [joint for joint in used if joint.edge.source in group]
-            root = anchor if anchor in group else min(group)
-            initial = _spread(root, firm, here)
-            solution = solve_graph(
-                root, firm, [j.edge for j in here], initial, config.inlier_probability
-            )
-            for joint, agrees in zip(here, solution.is_inlier, strict=True):
-                if not agrees:
-                    is_inlier[joint.key] = False
-                    num_dropped += 1
-            components.append(solution.T_anchor_submap)
-        if num_dropped == 0:
-            return [
-                Joint(j.key, j.edge, j.probability, is_inlier[j.key]) for j in ordered
-            ], components
+class _Planner:
+    """One working-out of the plan; the steps of the module's description in `run`."""
+
+    def __init__(
+        self,
+        library: Library,
+        answers: Mapping[MatchKey, Answer],
+        standing: AbstractSet[MatchKey],
+        anchor: SubmapId,
+        config: MapQueueConfig,
+    ) -> None:
+        self._library, self._config, self._anchor = library, config, anchor
+        self._answers, self._standing = answers, standing
+        self._verifier = Verifier(library, answers, config)
+        self._units = library.whole_units()
+
+    def run(self) -> Plan:
+        ranked = self._ranked(self._units)
+        first = [pair for pair in ranked if pair in self._partners(ranked)]
+        joints = self._match_vehicles(first)
+        if not self._is_waiting():
+            apart = self._apart(joints, [pair for pair in ranked if pair not in set(first)])
+            joints += self._match_vehicles(apart)
+        if not self._is_waiting():
+            joints += self._match_meeting(joints)
+        for _ in range(len(self._units)):
+            if self._is_waiting():
+                break
+            more = self._match_components(joints)
+            if not more:
+                break
+            joints += more
+        return self._finish(joints)
+
+    def _is_waiting(self) -> bool:
+        return bool(self._verifier.wanted)
+
+    def _ranked(self, units: Mapping[str, Unit]) -> list[tuple[str, str]]:
+        """Pairs of vehicles, most promising first."""
+        shapes = {vehicle: self._library.shape(unit) for vehicle, unit in units.items()}
+        pairs = itertools.combinations(sorted(units), 2)
+        return sorted(pairs, key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
+
+    def _partners(self, ranked: Sequence[tuple[str, str]]) -> set[tuple[str, str]]:
+        """Pairs that are among the best few of either vehicle."""
+        count: dict[str, int] = {}
+        chosen: set[tuple[str, str]] = set()
+        for pair in ranked:
+            if min(count.get(vehicle, 0) for vehicle in pair) < self._config.max_partners:
+                chosen.add(pair)
+                for vehicle in pair:
+                    count[vehicle] = count.get(vehicle, 0) + 1
+        return chosen
+
+    def _match_vehicles(self, pairs: Iterable[tuple[str, str]]) -> list[Joint]:
+        joints: list[Joint] = []
+        for target, source in pairs:
+            match = Match(self._units[source], self._units[target])
+            sides = self._library.vehicle_side(source), self._library.vehicle_side(target)
+            joints += self._verifier.joints_of(match, *sides)
+        return joints
+
+    def _apart(
+        self, joints: Sequence[Joint], pairs: Iterable[tuple[str, str]]
+    ) -> list[tuple[str, str]]:
+        """Pairs whose vehicles are in different components."""
+        _, components = self._settle(joints)
+        where = _component_of(components)
+        return [(a, b) for a, b in pairs if where[self._unit_id(a)] != where[self._unit_id(b)]]
+
+    def _unit_id(self, vehicle: str) -> SubmapId:
+        return self._units[vehicle].reference
+
+    def _match_meeting(self, joints: Sequence[Joint]) -> list[Joint]:
+        """Step 3: a prior from the graph for vehicles without a match of their own."""
+        settled, components = self._settle(joints)
+        where = _component_of(components)
+        matched = {frozenset((j.edge.source[0], j.edge.target[0])) for j in settled if j.is_inlier}
+        found: list[Joint] = []
+        for target, source in itertools.combinations(sorted(self._units), 2):
+            index = where[self._unit_id(target)]
+            if frozenset((source, target)) in matched or index != where[self._unit_id(source)]:
+                continue
+            component = components[index]
+            sides = [self._library.component_side(component, v) for v in (source, target)]
+            found += self._verifier.joints_nearby(sides[0], sides[1])
+        return found
+
+    def _match_components(self, joints: Sequence[Joint]) -> list[Joint]:
+        """Step 4."""
+        _, components = self._settle(joints)
+        sides = [self._library.component_side(component) for component in components]
+        sides = [side for side in sides if side.T_frame_submap]
+        candidates: list[tuple[float, Match, Side, Side]] = []
+        for target, source in itertools.combinations(sides, 2):
+            candidates += self._between(source, target)
+            candidates += self._between(target, source, is_turned=True)
+        candidates.sort(key=lambda c: (-c[0], c[1].key))
+        found: list[Joint] = []
+        taken: dict[frozenset[SubmapId], int] = {}
+        seen = {frozenset((key[0], key[1])) for key in self._verifier.visited}
+        for _, match, source_side, target_side in candidates:
+            units = frozenset((match.source.key, match.target.key))
+            if units in seen:
+                continue  # asked before, perhaps the other way round
+            seen.add(units)
+            ends = frozenset((min(source_side.T_frame_submap), min(target_side.T_frame_submap)))
+            taken[ends] = taken.get(ends, 0) + 1
+            if taken[ends] <= self._config.max_part_searches:
+                found += self._verifier.joints_of(match, source_side, target_side)
+        return found
+
+    def _between(
+        self, source: Side, target: Side, *, is_turned: bool = False
+    ) -> list[tuple[float, Match, Side, Side]]:
+        """Parts of one component (or all of it) against all of another, with their promise."""
+        whole = self._library.component_unit(target)
+        target_shape = self._library.shape(whole)
+        units = self._library.parts(source)
+        vehicles = {i[0] for side in (source, target) for i in side.T_frame_submap}
+        if len(vehicles) > 2 and not is_turned:
+            units.append(self._library.component_unit(source))
+        found = []
+        for unit in units:
+            worth = promise(self._library.shape(unit), target_shape)
+            found.append((worth, Match(unit, whole), source, target))
+        return found
+
+    def _finish(self, joints: list[Joint]) -> Plan:
+        settled, components = self._settle(joints)
+        carried = self._carried(settled, components)
+        if carried:
+            settled, components = self._settle([*joints, *carried])
+        wanted = sorted(self._verifier.wanted.values(), key=self._is_joined(settled))
+        return Plan(wanted, settled, self._library.odometry.edges, components)
+
+    def _carried(self, settled: Sequence[Joint], components: Sequence[Component]) -> list[Joint]:
+        """Standing answers that this plan has not asked for, where it has nothing of its own."""
+        own = {frozenset((j.edge.source[0], j.edge.target[0])) for j in settled if j.is_inlier}
+        where = _component_of(components)
+        carried: list[Joint] = []
+        for key in sorted(self._standing - self._verifier.visited):
+            answer = self._answers.get(key)
+            if answer is None or not self._library.holds(answer.match):
+                continue
+            joint = self._verifier.joint(answer)
+            ends = joint.edge.source, joint.edge.target
+            is_own = frozenset((ends[0][0], ends[1][0])) in own
+            is_apart = where[ends[0]] != where[ends[1]]
+            if is_apart or (self._is_waiting() and not is_own):
+                carried.append(joint)
+        return carried
+
+    def _is_joined(self, joints: Sequence[Joint]):  # type: ignore[no-untyped-def]
+        joined = {frozenset((j.edge.source[0], j.edge.target[0])) for j in joints if j.is_inlier}
+
+        def key(match: Match) -> bool:
+            return frozenset((match.source.reference[0], match.target.reference[0])) in joined
+
+        return key
+
+    def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
+        return self._library.settle(self._anchor, joints, self._config.inlier_probability)
 
 
-def _joint(
-    key: MatchKey,
-    answer: Answer,
-    submaps: Mapping[SubmapId, StoredSubmap],
-    config: MapQueueConfig,
-) -> Joint:
-    edge = edge_of(answer, dict(submaps), config.edge_sigma_floor_m, config.edge_sigma_floor_rad)
-    return Joint(key, edge, answer.probability, True)
-
-
-def _whole_units(
-    submaps: Mapping[SubmapId, StoredSubmap], withdrawn: frozenset[SubmapId]
-) -> dict[str, Unit]:
-    members: dict[str, list[StoredSubmap]] = {}
-    for submap_id in sorted(submaps):
-        stored = submaps[submap_id]
-        if submap_id not in withdrawn and len(stored.footprint):
-            members.setdefault(submap_id[0], []).append(stored)
+def _component_of(components: Sequence[Component]) -> dict[SubmapId, int]:
     return {
-        vehicle: Unit.of(stored, [s.submap.T_odom_submap for s in stored], len(stored) // 2)
-        for vehicle, stored in members.items()
+        submap_id: index for index, component in enumerate(components) for submap_id in component
     }
-
-
-def _groups(
-    submaps: Mapping[SubmapId, StoredSubmap], odometry: list[Edge], edges: list[Edge]
-) -> list[set[SubmapId]]:
-    graph = nx.Graph()
-    graph.add_nodes_from(submaps)
-    graph.add_edges_from((edge.source, edge.target) for edge in (*odometry, *edges))
-    return list(nx.connected_components(graph))
-
-
-def _spread(root: SubmapId, firm: list[Edge], joints: list[Joint]) -> dict[SubmapId, SE2]:
-    """First guess of all poses: along odometry, and over the most probable joints."""
-    graph = nx.Graph()
-    graph.add_node(root)
-    for edge in firm:
-        graph.add_edge(edge.source, edge.target, cost=0.0, edge=edge)
-    for joint in joints:
-        ends = joint.edge.source, joint.edge.target
-        cost = 1.0 - joint.probability + 1e-3
-        if not graph.has_edge(*ends) or graph.edges[ends]["cost"] > cost:
-            graph.add_edge(*ends, cost=cost, edge=joint.edge)
-    tree = nx.minimum_spanning_tree(graph, weight="cost")
-    poses = {root: SE2()}
-    for known, new in nx.bfs_edges(tree, root, sort_neighbors=sorted):
-        edge = tree.edges[known, new]["edge"]
-        if edge.source == new:
-            poses[new] = poses[known] @ edge.T_target_source
-        else:
-            poses[new] = poses[known] @ edge.T_target_source.inverse()
-    return poses

@@ -15,7 +15,9 @@ from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, numbers_
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
 from uw_dslam_ros2.core.merging.graph import residual
+from uw_dslam_ros2.core.merging.library import Library, Memory
 from uw_dslam_ros2.core.merging.plan import Plan, make_plan
+from uw_dslam_ros2.core.merging.settling import LoopError, loop_errors
 from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
@@ -24,13 +26,11 @@ from uw_dslam_ros2.core.merging.types import (
     SubmapRecord,
     SubmapState,
 )
-from uw_dslam_ros2.core.merging.units import StoredSubmap, render_unit
+from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["MapQueue"]
-
-_UNIT_LOG_ODDS_MAX = 8.0
 
 
 class MapQueue:
@@ -49,6 +49,9 @@ class MapQueue:
         self._anchor: SubmapId | None = None
         self._vehicles: list[str] = []
         self._answers: dict[MatchKey, Answer] = {}
+        self._standing: frozenset[MatchKey] = frozenset()
+        self._memory: Memory = {}
+        self._library: Library | None = None
         self._in_flight: dict[int, Match] = {}
         self._next_request_id = 1
         self._plan_cache: Plan | None = None
@@ -196,6 +199,11 @@ class MapQueue:
             )
         return found
 
+    def loops(self) -> list[LoopError]:
+        """Cycles of three and more submaps in the graph, and by how much each fails to close."""
+        plan = self._plan()
+        return loop_errors(plan.odometry, [joint for joint in plan.joints if joint.is_inlier])
+
     def global_map(self) -> EvidenceGrid | None:
         """The fused map in frame "map"; None before there is any evidence."""
         mosaic = self._drawn()
@@ -241,6 +249,7 @@ class MapQueue:
             self._lattice,
             tuple(self._vehicles),
             self._next_request_id,
+            self._standing,
         )
 
     @classmethod
@@ -252,6 +261,7 @@ class MapQueue:
             queue._submaps[submap.submap_id] = stored
         queue._withdrawn = set(state.withdrawn)
         queue._answers = {answer.match.key: answer for answer in state.answers}
+        queue._standing = frozenset(state.standing)
         queue._anchor, queue._lattice = state.anchor, state.lattice
         queue._vehicles = list(state.vehicles)
         queue._next_request_id = state.next_request_id
@@ -260,7 +270,19 @@ class MapQueue:
     def _merged(self) -> dict[SubmapId, SE2]:
         return self._plan().components[0] if self._anchor is not None else {}
 
+    def _current_library(self) -> Library:
+        if self._library is None:
+            self._library = Library(
+                self._submaps,
+                frozenset(self._withdrawn),
+                self._memory,
+                self._config.num_neighbours,
+                self._config.part_length,
+            )
+        return self._library
+
     def _change(self) -> None:
+        self._library = None
         self._plan_cache = None
         self._is_drawn = False
 
@@ -268,23 +290,19 @@ class MapQueue:
         if self._plan_cache is None:
             if not self._submaps:
                 return Plan([], [], [], [])
-            self._plan_cache = make_plan(
-                self._submaps,
-                frozenset(self._withdrawn),
-                self._anchor or min(self._submaps),
-                self._answers,
-                self._config,
-            )
+            anchor = self._anchor or min(self._submaps)
+            library = self._current_library()
+            plan = make_plan(library, self._answers, self._standing, anchor, self._config)
+            self._standing = frozenset(joint.key for joint in plan.joints if joint.is_inlier)
+            self._plan_cache = plan
         return self._plan_cache
 
     def _request(self, match: Match) -> MatchRequest:
         request_id = self._next_request_id
         self._next_request_id += 1
         self._in_flight[request_id] = match
-        source = render_unit(match.source, self._submaps, _UNIT_LOG_ODDS_MAX)
-        target = render_unit(match.target, self._submaps, _UNIT_LOG_ODDS_MAX)
-        assert source is not None
-        assert target is not None
+        library = self._current_library()
+        source, target = library.render(match.source), library.render(match.target)
         return MatchRequest(
             request_id,
             source,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from uw_dslam_ros2.core.grid import GridSpec
 from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
-from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.answers import Answer, MatchKey
 
 __all__ = ["QueueState"]
 
@@ -29,3 +29,5 @@ class QueueState:
     vehicles: tuple[str, ...]
     """In order of first arrival."""
     next_request_id: int
+    standing: frozenset[MatchKey]
+    """Answers that hold in the graph."""

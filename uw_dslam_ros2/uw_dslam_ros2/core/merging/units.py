@@ -7,7 +7,7 @@ registration more to hold on to.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -107,7 +107,7 @@ class Unit:
 
 
 def render_unit(
-    unit: Unit, submaps: dict[SubmapId, StoredSubmap], log_odds_max: float
+    unit: Unit, submaps: Mapping[SubmapId, StoredSubmap], log_odds_max: float
 ) -> OccupancyMap | None:
     """Fuse a unit's submaps on the lattice of its reference; None where nothing was seen."""
     spec = submaps[unit.reference].submap.grid.spec

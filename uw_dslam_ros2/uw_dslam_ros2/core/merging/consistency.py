@@ -1,0 +1,106 @@
+"""Which registrations agree with each other.
+
+Two registrations between the same two maps close a cycle through the maps' own relative poses; the
+largest set in which every pair closes (Mangelson et al. 2018) is taken for true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from uw_dslam_ros2.core.mapping.submap import SubmapId
+from uw_dslam_ros2.core.merging.graph import (
+    Edge,
+    compose_covariance,
+    invert_covariance,
+    mahalanobis,
+)
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["Side", "consistent_set", "cycle_distance"]
+
+FloatArray = NDArray[np.float64]
+
+_MAX_CLIQUE_EDGES = 60
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Side:
+    """Submaps placed in one frame, and how sure their relative poses are.
+
+    ``covariance(target, source)`` (3, 3) is that of ``T_target_source``.
+    """
+
+    T_frame_submap: Mapping[SubmapId, SE2]
+    covariance: Callable[[SubmapId, SubmapId], FloatArray]
+
+    def between(self, target: SubmapId, source: SubmapId) -> SE2:
+        """``T_target_source`` of two members."""
+        return self.T_frame_submap[target].inverse() @ self.T_frame_submap[source]
+
+
+def cycle_distance(first: Edge, second: Edge, source: Side, target: Side) -> float:
+    """Squared Mahalanobis distance by which two edges from `source` to `target` fail to close."""
+    forth, back = first.T_target_source, second.T_target_source.inverse()
+    motions = [
+        forth,
+        source.between(first.source, second.source),
+        back,
+        target.between(second.target, first.target),
+    ]
+    covariances = [
+        first.covariance,
+        source.covariance(first.source, second.source),
+        invert_covariance(second.covariance, second.T_target_source),
+        target.covariance(second.target, first.target),
+    ]
+    total = np.zeros((3, 3))
+    for index, covariance in enumerate(covariances):
+        left, right = SE2(), SE2()
+        for motion in motions[:index]:
+            left = left @ motion
+        for motion in motions[index + 1 :]:
+            right = right @ motion
+        total += compose_covariance(covariance, left, motions[index], right)
+    closed = motions[0] @ motions[1] @ motions[2] @ motions[3]
+    return mahalanobis(closed, total)
+
+
+def consistent_set(
+    edges: Sequence[Edge],
+    weights: Sequence[float],
+    source: Side,
+    target: Side,
+    inlier_probability: float,
+) -> list[int]:
+    """Indices, rising, of the heaviest set of edges that agree pairwise.
+
+    Parameters
+    ----------
+    edges
+        All from `source` to `target`.
+    weights
+        What each is worth, in (0, 1]; more edges beat heavier ones.
+    source, target
+        The two maps.
+    inlier_probability
+        Share of true pairs that the chi-square test lets pass.
+    """
+    threshold = float(chi2.ppf(inlier_probability, 3))
+    graph = nx.Graph()
+    # A clique finder takes exponential time in the worst case.
+    order = sorted(range(len(edges)), key=lambda i: (-weights[i], i))[:_MAX_CLIQUE_EDGES]
+    for i in sorted(order):
+        graph.add_node(i, weight=1000 + round(100 * weights[i]))
+    for i in graph:
+        for j in graph:
+            if i < j and cycle_distance(edges[i], edges[j], source, target) <= threshold:
+                graph.add_edge(i, j)
+    clique, _ = nx.max_weight_clique(graph, weight="weight")
+    return sorted(clique)

@@ -1,0 +1,184 @@
+"""All submaps that are known, and what has been worked out of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.mapping.submap import SubmapId
+from uw_dslam_ros2.core.merging.answers import Match
+from uw_dslam_ros2.core.merging.consistency import Side
+from uw_dslam_ros2.core.merging.descriptors import MapShape, shape_of
+from uw_dslam_ros2.core.merging.odometry import Odometry
+from uw_dslam_ros2.core.merging.settling import Component, Joint, settle
+from uw_dslam_ros2.core.merging.units import StoredSubmap, Unit, render_unit, shared_area_m2
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["Library", "Memory", "milestone"]
+
+FloatArray = NDArray[np.float64]
+Memory = dict[Hashable, Any]
+"""Results by what they depend on; may be thrown away at any time."""
+
+_GROWTH = 1.5
+_UNIT_LOG_ODDS_MAX = 8.0
+_MAX_MEMORY = 200_000
+
+
+def milestone(count: int) -> int:
+    """Largest of 1, 2, 3, 4, 6, 9, 13, 19, ... that is not above a count.
+
+    A map is matched anew when it has grown by half, and not with each submap.
+    """
+    reached = 1
+    while (following := max(reached + 1, int(reached * _GROWTH))) <= count:
+        reached = following
+    return reached
+
+
+class Library:
+    """Units and sides of one state of the submaps.
+
+    Parameters
+    ----------
+    submaps
+        All; withdrawn ones still carry their vehicle's odometry.
+    withdrawn
+        Those that are neither matched nor drawn.
+    memory
+        Kept from state to state by the caller.
+    """
+
+    def __init__(
+        self,
+        submaps: Mapping[SubmapId, StoredSubmap],
+        withdrawn: frozenset[SubmapId],
+        memory: Memory,
+        num_neighbours: int,
+        part_length: int,
+    ) -> None:
+        self.submaps = submaps
+        self.odometry = Odometry(submaps)
+        self._memory = memory
+        self._num_neighbours, self._part_length = num_neighbours, part_length
+        if len(memory) > _MAX_MEMORY:
+            memory.clear()
+        self.active = {
+            i: s for i, s in sorted(submaps.items()) if i not in withdrawn and len(s.footprint)
+        }
+        self._by_vehicle: dict[str, list[SubmapId]] = {}
+        for submap_id in self.active:
+            self._by_vehicle.setdefault(submap_id[0], []).append(submap_id)
+        self._state = tuple(
+            (i, s.submap.T_odom_submap, s.submap.covariance.tobytes())
+            for i, s in sorted(submaps.items())
+        )
+
+    def whole_units(self) -> dict[str, Unit]:
+        """Each vehicle's map up to its last milestone, of closed submaps where there are any."""
+        units = {}
+        for vehicle in self._by_vehicle:
+            ids = self._closed(vehicle)
+            units[vehicle] = self._odometry_unit(ids[: milestone(len(ids))])
+        return units
+
+    def window(self, submap_id: SubmapId) -> Unit:
+        """A submap with its neighbours in its vehicle's sequence."""
+        ids = self._closed(submap_id[0])
+        index = ids.index(submap_id)
+        reach = self._num_neighbours if len(ids) > 2 * self._num_neighbours + 1 else 0
+        low, high = max(0, index - reach), index + reach + 1
+        return self._odometry_unit(ids[low:high], submap_id)
+
+    def parts(self, side: Side) -> list[Unit]:
+        """Stretches of each vehicle in a side, overlapping by half; never all of a vehicle."""
+        units: list[Unit] = []
+        for vehicle in sorted({submap_id[0] for submap_id in side.T_frame_submap}):
+            ids = self._closed(vehicle)
+            length = min(self._part_length, -(-len(ids) // 2))
+            stride = max(1, length // 2)
+            last = len(ids) - length
+            for start in sorted({*range(0, last, stride), last}):
+                units.append(self._odometry_unit(ids[start : start + length]))
+        return units
+
+    def component_unit(self, side: Side) -> Unit:
+        """Everything in a side as one map."""
+        ids = sorted(side.T_frame_submap)
+        members = [self.active[i] for i in ids]
+        poses = [side.T_frame_submap[i] for i in ids]
+        return Unit.of(members, poses, len(ids) // 2)
+
+    def vehicle_side(self, vehicle: str) -> Side:
+        """A vehicle's closed submaps, placed by its own odometry."""
+        poses = {i: self.odometry.T_odom_submap(i) for i in self._closed(vehicle)}
+        return Side(poses, self.odometry.covariance)
+
+    def component_side(self, component: Component, vehicle: str | None = None) -> Side:
+        """The closed submaps of a component, or of one vehicle in it, placed by the graph."""
+        vehicles = sorted({i[0] for i in component}) if vehicle is None else [vehicle]
+        ids = [i for v in vehicles if v in self._by_vehicle for i in self._closed(v)]
+        poses = {i: component[i] for i in ids if i in component}
+        first = {v: self._closed(v)[0] for v in vehicles if v in self._by_vehicle}
+
+        def covariance(target: SubmapId, source: SubmapId) -> FloatArray:
+            if target[0] == source[0]:
+                return self.odometry.covariance(target, source)
+            # Through each vehicle's beginning: an honest guess from above.
+            return self.odometry.covariance(target, first[target[0]]) + (
+                self.odometry.covariance(source, first[source[0]])
+            )
+
+        return Side(poses, covariance)
+
+    def holds(self, match: Match) -> bool:
+        """Whether all submaps of a question are still in use."""
+        return all(i in self.active for i in (*match.source.ids, *match.target.ids))
+
+    def render(self, unit: Unit) -> OccupancyMap:
+        """The unit's map; not remembered, for its size."""
+        occupancy = render_unit(unit, self.submaps, _UNIT_LOG_ODDS_MAX)
+        assert occupancy is not None, "active submaps hold something"
+        return occupancy
+
+    def shape(self, unit: Unit) -> MapShape:
+        """Descriptor of the unit's map."""
+        return self._remember(("shape", unit.key), lambda: shape_of(self.render(unit)))
+
+    def shared_area_m2(self, source: SubmapId, target: SubmapId, T_target_source: SE2) -> float:
+        """Area that two submaps have both seen."""
+        first, second = self.submaps[source], self.submaps[target]
+        if math.hypot(T_target_source.x, T_target_source.y) > first.radius_m + second.radius_m:
+            return 0.0
+        key = ("area", first.digest, second.digest, T_target_source)
+        return self._remember(key, lambda: shared_area_m2(first, second, T_target_source))
+
+    def settle(
+        self, anchor: SubmapId, joints: Sequence[Joint], inlier_probability: float
+    ) -> tuple[list[Joint], list[Component]]:
+        """Solve the pose graph; see `settling.settle`."""
+        key = ("graph", self._state, anchor, tuple(sorted(joint.key for joint in joints)))
+        edges = self.odometry.edges
+        return self._remember(
+            key, lambda: settle(self.submaps, anchor, edges, joints, inlier_probability)
+        )
+
+    def _closed(self, vehicle: str) -> list[SubmapId]:
+        """A vehicle's closed submaps; all of them where none is closed yet."""
+        ids = self._by_vehicle[vehicle]
+        return [i for i in ids if self.active[i].submap.is_final] or ids
+
+    def _odometry_unit(self, ids: Sequence[SubmapId], reference: SubmapId | None = None) -> Unit:
+        members = [self.active[i] for i in ids]
+        poses = [self.odometry.T_odom_submap(i) for i in ids]
+        return Unit.of(members, poses, ids.index(reference) if reference else len(ids) // 2)
+
+    def _remember(self, key: Hashable, work: Any) -> Any:
+        if key not in self._memory:
+            self._memory[key] = work()
+        return self._memory[key]
