@@ -11,10 +11,12 @@ from uw_dslam_ros2.core.registration.baselines.orb_ransac import orb_ransac
 from uw_dslam_ros2.core.registration.baselines.pair_voting import pair_voting
 from uw_dslam_ros2.core.registration.baselines.peers import PEERS, available_peers
 from uw_dslam_ros2.core.registration.baselines.result import BaselineResult, procrustes
+from uw_dslam_ros2.core.registration.baselines.suite import PointMatcher, point_baselines
 
 __all__ = [
     "PEERS",
     "BaselineResult",
+    "PointMatcher",
     "available_peers",
     "correlative",
     "go_icp",
@@ -23,5 +25,6 @@ __all__ = [
     "ndt",
     "orb_ransac",
     "pair_voting",
+    "point_baselines",
     "procrustes",
 ]

@@ -91,7 +91,7 @@ def go_icp(
     target: ArrayLike,
     *,
     trim: float = 0.0,
-    gap: float = 0.001,
+    gap: float = 0.05,
     pitch_m: float = 0.01,
     max_rotations: int = 4000,
 ) -> BaselineResult:
@@ -104,7 +104,8 @@ def go_icp(
     trim : float
         Share of the source's points left out of the error, in [0, 1): what has no counterpart.
     gap : float
-        Stop when the mean square distance [m^2] is proven to within this.
+        Stop when the mean square distance is proven to within this share of what a random motion
+        has, which is A / (pi n) before trimming, with A the area of the target's bounding box.
     pitch_m : float
         Side [m] of a cell of the distance table.
     max_rotations : int
@@ -124,7 +125,7 @@ def go_icp(
     distances, origin = _distance_table(moved, pitch_m)
     num_kept = max(2, round(len(points) * (1.0 - trim)))
     num_kept = min(num_kept, len(points))
-    slack_sum = gap * num_kept
+    slack_sum = gap * num_kept * _random_square(target, num_kept / len(points))
 
     def inner(theta: float, slack: FloatArray, best: float) -> tuple[float, float, float, int]:
         turned = points @ SE2(yaw=theta).rotation().T
@@ -156,6 +157,17 @@ def go_icp(
     T_target_source = SE2(*c_y.tolist()) @ T_best @ SE2(*(-c_x).tolist())
     diagnostics = {"num_rotations": float(opened), "num_errors": float(count)}
     return BaselineResult(T_target_source, -best / num_kept, diagnostics)
+
+
+def _random_square(target: FloatArray, kept: float) -> float:
+    """Mean square distance [m^2] that the best `kept` share of points has at a random motion.
+
+    Square distances to the nearest of n points spread evenly over A are exponential with mean
+    A / (pi n).
+    """
+    area = float(np.prod(target.max(axis=0) - target.min(axis=0)))
+    trimmed = 1.0 + (1.0 - kept) * math.log(1.0 - kept) / kept if kept < 1.0 else 1.0
+    return max(trimmed * area / (math.pi * len(target)), 1e-9)
 
 
 def _polished(
