@@ -279,7 +279,8 @@ class VehicleMapper:
         if self._is_key(stamp_ns):
             self._match(detections, T_base_sonar)
         T_submap_base, covariance = self._navigation.relative_at(stamp_ns)
-        sigma_m = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+        # At the submap's own start the covariance is zero, which may come out as a trace below it.
+        sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
         if self._open.should_close(stamp_ns, sigma_m):
             issued = self._close()
             self._begin(stamp_ns, T_submap_base, covariance)
