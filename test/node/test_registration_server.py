@@ -12,6 +12,7 @@ pytest.importorskip("rclpy")
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point
+from places import room_map
 from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
@@ -58,16 +59,6 @@ def answered(until, client, request):
     future = client.call_async(request)
     until(future.done, "an answer")
     return future.result()
-
-
-def room_map(resolution_m=0.1, T_frame_grid=SE2()):
-    """A closed room with an odd corner: 12 m x 8 m, free inside, walls known."""
-    values = np.full((90, 130), -1, np.int8)
-    values[5:85, 5:125] = 0
-    values[5:85, [5, 124]] = values[[5, 84], 5:125] = 100
-    values[5:40, 80] = values[40, 80:125] = 100
-    values[60:62, 20:40] = 100
-    return OccupancyMap(GridSpec(resolution_m, 90, 130, T_frame_grid), values)
 
 
 def map_msg(occupancy=None):

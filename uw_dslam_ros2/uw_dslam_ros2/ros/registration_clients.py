@@ -35,6 +35,7 @@ class _Server:
     client: Client
     asked: dict[int, _Asked] = field(default_factory=dict)
     busy_until_s: float = 0.0
+    num_silent: int = 0  # requests in a row that it did not answer in time
     instance: str = ""
 
 
@@ -124,7 +125,7 @@ class RegistrationClients:
         ]
         if not free:
             return False
-        server = min(free, key=lambda server: len(server.asked))
+        server = min(free, key=lambda server: (server.num_silent, len(server.asked)))
         future = server.client.call_async(request)
         server.asked[request_id] = _Asked(future, now_s + self._timeout_s)
         future.add_done_callback(
@@ -143,6 +144,7 @@ class RegistrationClients:
         if asked is None or asked.future is not future or future.cancelled():
             return  # given up before
         del server.asked[request_id]
+        server.num_silent = 0
         response: Any = future.result()
         if response.result == RegisterMaps.Response.BUSY:
             server.busy_until_s = time.monotonic() + _BUSY_PAUSE_S
@@ -160,6 +162,7 @@ class RegistrationClients:
                 if is_gone:
                     lost.append((request_id, f"{server.name} is gone"))
                 elif now_s > asked.deadline_s:
+                    server.num_silent += 1
                     lost.append(
                         (request_id, f"{server.name} gave no answer in {self._timeout_s:.0f} s")
                     )

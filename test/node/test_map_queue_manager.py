@@ -1,0 +1,329 @@
+"""The manager with real registration servers: merging, services, TF, failures."""
+
+import contextlib
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from map_msgs.msg import OccupancyGridUpdate
+from nav_msgs.msg import OccupancyGrid
+from places import room_submap
+from rclpy.parameter import Parameter
+from tf2_msgs.msg import TFMessage
+from uw_dslam_msgs.msg import MergeStatus, SubmapInfo
+from uw_dslam_msgs.msg import Submap as SubmapMsg
+from uw_dslam_msgs.srv import (
+    GetSubmap,
+    ListSubmaps,
+    LoadSession,
+    RegisterMaps,
+    RestoreSubmap,
+    SaveMap,
+    SaveSession,
+    WithdrawSubmap,
+)
+from visualization_msgs.msg import MarkerArray
+
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.ros.conversions import occupancy_from_msg, submap_to_msg
+from uw_dslam_ros2.ros.map_queue_manager import MapQueueManager
+from uw_dslam_ros2.ros.qos import LATCHED, SUBMAPS
+from uw_dslam_ros2.ros.registration_server import RegistrationServer
+
+pytestmark = pytest.mark.ros
+
+T_ROOM = {"auv_1": SE2(2.0, 3.0, 0.0), "auv_2": SE2(5.0, 4.0, 2.0)}
+FAST = {"publish_period_s": 0.1, "full_map_period_s": 0.1}
+
+
+class Probe:
+    """A plain node that sends submaps and hears all that the manager says."""
+
+    def __init__(self, context):
+        self.node = rclpy.create_node("probe", context=context)
+        self.statuses, self.maps, self.updates, self.markers = [], [], [], []
+        self.transforms = {}
+        node = self.node
+        node.create_subscription(MergeStatus, "/merge_status", self.statuses.append, LATCHED)
+        node.create_subscription(OccupancyGrid, "/map", self.maps.append, LATCHED)
+        node.create_subscription(OccupancyGridUpdate, "/map_updates", self.updates.append, 10)
+        node.create_subscription(MarkerArray, "/pose_graph", self.markers.append, LATCHED)
+        node.create_subscription(TFMessage, "/tf", self._on_tf, 100)
+        self._publishers = {}
+
+    def _on_tf(self, msg):
+        for transform in msg.transforms:
+            self.transforms[transform.header.frame_id, transform.child_frame_id] = transform
+
+    def send(self, submap):
+        topic = f"/{submap.vehicle_id}/submap"
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(SubmapMsg, topic, SUBMAPS)
+        self._publishers[topic].publish(submap_to_msg(submap))
+
+    @property
+    def num_merged(self):
+        return self.statuses[-1].num_merged if self.statuses else 0
+
+    def states(self):
+        infos = self.statuses[-1].submaps if self.statuses else []
+        return {(info.vehicle_id, info.sequence): info.state for info in infos}
+
+
+@pytest.fixture
+def manage(ros_context, spinning):
+    """``with manage(settings) as (until, probe, call)``: a manager, a server, a probe."""
+
+    @contextlib.contextmanager
+    def run(*, has_server=True, **settings):
+        parameters = [Parameter(k.replace("__", "."), value=v) for k, v in settings.items()]
+        probe = Probe(ros_context)
+        nodes = [MapQueueManager(context=ros_context, parameter_overrides=parameters), probe.node]
+        if has_server:
+            nodes.append(RegistrationServer(context=ros_context))
+
+        with spinning(*nodes) as until:
+
+            def call(service_type, name, **fields):
+                client = probe.node.create_client(service_type, f"/map_queue_manager/{name}")
+                until(client.service_is_ready, name)
+                future = client.call_async(service_type.Request(**fields))
+                until(future.done, f"answer of {name}")
+                return future.result()
+
+            yield until, probe, call
+
+    return run
+
+
+def two_submaps():
+    return [room_submap(name, T_room_submap=T_ROOM[name]) for name in ("auv_1", "auv_2")]
+
+
+def test_two_vehicles_become_one_map(manage):
+    first, second = two_submaps()
+    with manage(**FAST) as (until, probe, _):
+        probe.send(first)
+        until(lambda: probe.num_merged == 1, "the first submap")
+        until(lambda: ("map", "auv_1/map") in probe.transforms, "TF of the first")
+        assert ("map", "auv_2/map") not in probe.transforms
+        probe.send(second)
+        until(lambda: probe.num_merged == 2, "the merge")
+        until(lambda: ("map", "auv_2/map") in probe.transforms, "TF of the second")
+        until(lambda: probe.maps and probe.markers, "map and graph")
+        status = probe.statuses[-1]
+        transform = probe.transforms["map", "auv_2/map"].transform
+        until(
+            lambda: (occupancy_from_msg(probe.maps[-1]).values > 50).sum() > 300,
+            "walls in the map",
+        )
+        occupancy = occupancy_from_msg(probe.maps[-1])
+    assert status.num_components == 1
+    assert status.num_servers == 1
+    edges = [c for c in status.constraints if c.kind == c.REGISTRATION]
+    assert len(edges) == 1
+    assert edges[0].is_inlier
+    # The global frame is that of the first submap: auv_2's odom is where it is seen from there.
+    expected = T_ROOM["auv_1"].inverse() @ T_ROOM["auv_2"]
+    assert transform.translation.x == pytest.approx(expected.x, abs=0.1)
+    assert transform.translation.y == pytest.approx(expected.y, abs=0.1)
+    assert probe.maps[-1].header.frame_id == "map"
+    # A wall seen by both is where the first one saw it.
+    wall = first.grid.spec.centers_of(np.argwhere(first.grid.values == 100))
+    cells = occupancy.spec.cells_of(wall)
+    assert (occupancy.values[cells[:, 0], cells[:, 1]] > 50).mean() > 0.9
+
+
+def test_submaps_wait_for_a_server_that_starts_late(manage, ros_context):
+    with manage(has_server=False, **FAST) as (until, probe, _):
+        for submap in two_submaps():
+            probe.send(submap)
+        until(lambda: len(probe.states()) == 2, "both submaps")
+        assert probe.statuses[-1].num_servers == 0
+        assert probe.num_merged == 1
+        server = RegistrationServer(context=ros_context)
+        executor = rclpy.executors.SingleThreadedExecutor(context=ros_context)
+        executor.add_node(server)
+
+        def both_spin():
+            executor.spin_once(timeout_sec=0.01)
+            return probe.num_merged == 2
+
+        until(both_spin, "the merge")
+        server.destroy_node()
+
+
+def test_busy_server_is_asked_again(manage):
+    asked = []
+
+    def refuse(request, response):
+        asked.append(request)
+        response.result = RegisterMaps.Response.BUSY
+        return response
+
+    with manage(has_server=False, **FAST) as (until, probe, _):
+        probe.node.create_service(RegisterMaps, "/busy/register_maps", refuse)
+        for submap in two_submaps():
+            probe.send(submap)
+        until(lambda: len(asked) >= 2, "the second try")
+        assert probe.num_merged == 1
+
+
+@pytest.mark.parametrize("is_lost_by", ["death", "silence"])
+def test_lost_request_is_asked_again_of_another_server(manage, ros_context, is_lost_by):
+    """The first server takes the question and never answers; it dies, or it stays silent."""
+    timeout_s = 1.0 if is_lost_by == "silence" else 1000.0
+    silent = rclpy.create_node("silent", context=ros_context)  # nobody spins it
+    silent.create_service(RegisterMaps, "~/register_maps", lambda _, response: response)
+    with manage(has_server=False, request_timeout_s=timeout_s, **FAST) as (until, probe, _):
+        for submap in two_submaps():
+            probe.send(submap)
+        until(lambda: probe.statuses and probe.statuses[-1].num_in_flight == 1, "the question")
+        server = RegistrationServer(context=ros_context)
+        executor = rclpy.executors.SingleThreadedExecutor(context=ros_context)
+        executor.add_node(server)
+        if is_lost_by == "death":
+            silent.destroy_node()
+
+        def both_spin():
+            executor.spin_once(timeout_sec=0.01)
+            return probe.num_merged == 2
+
+        until(both_spin, "the merge")
+        server.destroy_node()
+    silent.destroy_node()
+
+
+def test_same_submap_again_changes_nothing(manage):
+    with manage(has_server=False, **FAST) as (until, probe, call):
+        first, _ = two_submaps()
+        probe.send(first)
+        until(lambda: probe.num_merged == 1, "the submap")
+        before = call(ListSubmaps, "list_submaps").submaps
+        probe.send(first)
+        probe.send(room_submap("auv_3"))  # the queue has seen the repeat when it has seen this
+        until(lambda: ("auv_3", 0) in probe.states(), "the next submap")
+        assert call(ListSubmaps, "list_submaps", vehicle_id="auv_1").submaps == before
+
+
+def test_bad_submap_is_refused_and_the_manager_lives(manage):
+    with manage(has_server=False, **FAST) as (until, probe, _):
+        bad = submap_to_msg(room_submap("auv_1"))
+        bad.grid.info.resolution = -1.0
+        publisher = probe.node.create_publisher(SubmapMsg, "/auv_1/submap", SUBMAPS)
+        publisher.publish(bad)
+        until(
+            lambda: (
+                probe.statuses and "grid.info.resolution is -1.0" in probe.statuses[-1].message
+            ),
+            "a complaint",
+        )
+        publisher.publish(submap_to_msg(room_submap("auv_1")))
+        until(lambda: probe.num_merged == 1, "the good one")
+
+
+def test_withdrawn_submap_stays_out_until_restored(manage):
+    first, second = two_submaps()
+    with manage(**FAST) as (until, probe, call):
+        probe.send(first)
+        probe.send(second)
+        until(lambda: probe.num_merged == 2, "the merge")
+        key = {"vehicle_id": "auv_2", "sequence": 0}
+        response = call(WithdrawSubmap, "withdraw_submap", **key)
+        assert response.result == WithdrawSubmap.Response.DONE
+        until(lambda: probe.states()["auv_2", 0] == SubmapInfo.WITHDRAWN, "the withdrawal")
+        probe.send(room_submap("auv_2", revision=1, T_room_submap=T_ROOM["auv_2"]))
+        probe.send(room_submap("auv_3"))
+        until(lambda: ("auv_3", 0) in probe.states(), "what was sent after it")
+        assert probe.states()["auv_2", 0] == SubmapInfo.WITHDRAWN
+        assert call(RestoreSubmap, "restore_submap", **key).result == RestoreSubmap.Response.DONE
+        until(lambda: probe.states()["auv_2", 0] == SubmapInfo.MERGED, "the return")
+        missing = call(WithdrawSubmap, "withdraw_submap", vehicle_id="auv_9", sequence=4)
+        assert missing.result == WithdrawSubmap.Response.NOT_FOUND
+        assert "auv_9/4" in missing.message
+
+
+def test_services_list_and_give_submaps(manage):
+    with manage(has_server=False, **FAST) as (until, probe, call):
+        for sequence in (1, 0):
+            probe.send(room_submap("auv_1", sequence, T_odom_submap=SE2(sequence * 1.0, 0.0, 0.0)))
+        until(lambda: len(probe.states()) == 2, "both submaps")
+        listed = call(ListSubmaps, "list_submaps").submaps
+        assert [(info.vehicle_id, info.sequence) for info in listed] == [
+            ("auv_1", 0),
+            ("auv_1", 1),
+        ]
+        assert call(ListSubmaps, "list_submaps", vehicle_id="auv_7").submaps == []
+        got = call(GetSubmap, "get_submap", vehicle_id="auv_1", sequence=1)
+        assert got.result == GetSubmap.Response.DONE
+        assert got.submap.pose.pose.position.x == 1.0
+        assert got.info.sequence == 1
+        none = call(GetSubmap, "get_submap", vehicle_id="auv_1", sequence=7)
+        assert none.result == GetSubmap.Response.NOT_FOUND
+
+
+def test_map_is_saved_as_map_server_files(manage, tmp_path):
+    with manage(has_server=False, **FAST) as (until, probe, call):
+        empty = call(SaveMap, "save_map", path=str(tmp_path / "map"))
+        assert empty.result == SaveMap.Response.NOTHING_TO_SAVE
+        submap = room_submap("auv_1")
+        probe.send(submap)
+        until(lambda: probe.num_merged == 1, "the submap")
+        saved = call(SaveMap, "save_map", path=str(tmp_path / "new" / "map"))
+        assert saved.result == SaveMap.Response.DONE, saved.message
+        assert str(tmp_path / "new" / "map.yaml") in saved.files
+        failed = call(SaveMap, "save_map", path="/proc/nowhere/map")
+        assert failed.result == SaveMap.Response.FAILED
+        assert "/proc/nowhere" in failed.message
+    again = read_map(tmp_path / "new" / "map.yaml")
+    assert (again.values == 100).sum() == (submap.grid.values == 100).sum()
+
+
+def test_session_is_saved_and_loaded(manage, tmp_path):
+    folder = str(tmp_path / "session")
+    with manage(**FAST) as (until, probe, call):
+        for submap in two_submaps():
+            probe.send(submap)
+        until(lambda: probe.num_merged == 2, "the merge")
+        saved = call(SaveSession, "save_session", path=folder)
+        assert saved.result == SaveSession.Response.DONE, saved.message
+        assert any(name.endswith("graph.g2o") for name in saved.files)
+    # Without any server: what was accepted before is not asked again.
+    with manage(has_server=False, **FAST) as (until, probe, call):
+        missing = call(LoadSession, "load_session", path=str(tmp_path / "none"))
+        assert missing.result == LoadSession.Response.NOT_FOUND
+        loaded = call(LoadSession, "load_session", path=folder)
+        assert (loaded.result, loaded.num_submaps) == (LoadSession.Response.DONE, 2)
+        until(lambda: probe.num_merged == 2, "the loaded session")
+
+
+def test_session_parameter_resumes_by_itself(manage, tmp_path):
+    folder = str(tmp_path / "session")
+    with manage(has_server=False, session=folder, **FAST) as (until, probe, _):
+        probe.send(room_submap("auv_1"))
+        until(lambda: probe.num_merged == 1, "the submap")
+    with manage(has_server=False, session=folder, **FAST) as (until, probe, _):
+        until(lambda: probe.num_merged == 1, "the resumed session")
+
+
+def test_changed_part_goes_out_as_an_update(manage):
+    with manage(has_server=False, publish_period_s=0.1, full_map_period_s=3600.0) as (
+        until,
+        probe,
+        _,
+    ):
+        probe.send(room_submap("auv_1"))
+        until(lambda: probe.maps, "the whole map")
+        num_maps = len(probe.maps)
+        # The same cells of the map, seen again by the next submap.
+        probe.send(room_submap("auv_1", sequence=1))
+        until(lambda: probe.updates, "an update")
+        update = probe.updates[-1]
+        assert len(update.data) == update.width * update.height > 0
+        assert update.x + update.width <= probe.maps[-1].info.width
+        assert update.y + update.height <= probe.maps[-1].info.height
+        assert len(probe.maps) == num_maps
