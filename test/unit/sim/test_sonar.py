@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.sim.clutter import Scatterers
 from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
 from uw_dslam_ros2.sim.world import Surface, WorldBuilder
 
@@ -52,7 +53,9 @@ def test_a_wall_is_a_bright_arc_at_its_exact_range(rng):
 
 
 def test_walls_seen_at_a_slant_answer_less():
-    config = SonarConfig(seabed_db=-80.0, noise_db=-80.0, ghost_db=-90.0)
+    config = SonarConfig(
+        seabed_db=-80.0, reverberation_db=-90.0, ring_db=-90.0, noise_db=-80.0, ghost_db=-90.0
+    )
     rng = np.random.default_rng(0)
 
     def brightness(slope_deg):
@@ -80,7 +83,7 @@ def test_behind_a_pile_there_is_a_shadow(rng):
 
 
 def test_strong_echoes_have_side_lobes_at_their_range(rng):
-    config = SonarConfig(seabed_db=-80.0, noise_db=-80.0)
+    config = SonarConfig(seabed_db=-80.0, reverberation_db=-90.0, ring_db=-90.0, noise_db=-80.0)
     target = [[9.9, -1.0], [9.9, 1.0]]
     images = [
         simulator(target, config=replace(config, side_lobe_db=db, far_lobe_db=db - 22.0))
@@ -96,7 +99,13 @@ def test_strong_echoes_have_side_lobes_at_their_range(rng):
 
 def test_the_surface_makes_a_ghost_behind_a_wall():
     # Down 3 m and 10 m away: by way of the surface once, half of 10 m + hypot(10 m, 6 m).
-    quiet = SonarConfig(seabed_db=-80.0, noise_db=-80.0, double_bounce_db=-90.0)
+    quiet = SonarConfig(
+        seabed_db=-80.0,
+        reverberation_db=-90.0,
+        ring_db=-90.0,
+        noise_db=-80.0,
+        double_bounce_db=-90.0,
+    )
     wall = [[10.0, -30.0], [10.0, 30.0]]
     rng = np.random.default_rng(1)
     powers = []
@@ -108,8 +117,54 @@ def test_the_surface_makes_a_ghost_behind_a_wall():
     assert powers[0][row - 1 : row + 2].max() > 5.0 * powers[1][row - 1 : row + 2].max()
 
 
+def test_a_wrong_speed_of_sound_scales_the_ranges(rng):
+    wall = [[15.0, -40.0], [15.0, 40.0]]
+    builder = WorldBuilder()
+    builder.add(WALL, wall)
+    world = builder.build("test", 0, (0.0, 0.0), 8.0)
+    for scale in (1.0, 1.1):
+        image = SonarSimulator(world, range_scale=scale).ping(0, SE2(), 3.0, rng)
+        column = image.intensity[:, 124:132].astype(float).mean(axis=1)
+        assert image.range_m[np.argmax(column)] == pytest.approx(15.0 * scale, abs=0.3)
+
+
+def test_fish_are_seen_where_they_are_unless_a_wall_hides_them():
+    config = SonarConfig(seabed_db=-80.0, reverberation_db=-90.0, ring_db=-90.0, ghost_db=-90.0)
+    fish = Scatterers(np.array([[8.0, 6.0], [20.0, -2.0]]), np.array([1.0, 1.0]))
+    rng = np.random.default_rng(2)
+
+    def power_at(sonar, x, y):
+        pings = [sonar.ping(0, SE2(), 3.0, rng, fish).intensity for _ in range(20)]
+        mean = np.mean([p.astype(float) ** 4 for p in pings], axis=0)
+        row = np.argmin(np.abs(sonar.range_m - math.hypot(x, y)))
+        beam = np.argmin(np.abs(sonar.bearing_rad - math.atan2(y, x)))
+        return mean[row - 2 : row + 3, beam - 2 : beam + 3].max()
+
+    open_water = simulator(config=config)
+    behind_wall = simulator([[15.0, -9.0], [15.0, 9.0]], config=config)
+    for sonar in (open_water, behind_wall):
+        # To port (y > 0) and in front of the wall; the mirrored place stays dark.
+        assert power_at(sonar, 8.0, 6.0) > 100.0 * power_at(sonar, 8.0, -6.0)
+    assert power_at(open_water, 20.0, -2.0) > 30.0 * power_at(behind_wall, 20.0, -2.0)
+
+
+def test_the_water_and_the_surface_answer_too(rng):
+    # Rings lie at 3 m (the surface) and 5 m (the seabed below).
+    quiet = SonarConfig(seabed_db=-80.0, reverberation_db=-90.0, ring_db=-90.0)
+    ringing = replace(quiet, ring_db=-25.0)
+    hazy = replace(quiet, reverberation_db=-30.0)
+    dark, rings, haze = (
+        simulator(config=c).ping(0, SE2(), 3.0, rng).intensity.astype(float).mean(axis=1)
+        for c in (quiet, ringing, hazy)
+    )
+    assert rings[30] > 2.0 * dark[30]
+    assert rings[50] > 2.0 * dark[50]
+    assert rings[40] < 0.6 * rings[30]
+    assert haze[20] > haze[60] > haze[120] > 1.1 * dark[120]
+
+
 def test_gain_lifts_the_noise_with_range(rng):
-    sonar = simulator(config=SonarConfig(seabed_db=-80.0))
+    sonar = simulator(config=SonarConfig(seabed_db=-80.0, reverberation_db=-90.0, ring_db=-90.0))
     image = sonar.ping(0, SE2(0.0, 0.0, math.pi / 2), 3.0, rng).intensity.astype(float)
     bands = [image[a:b].mean() for a, b in ((20, 60), (200, 240), (300, 340), (360, 399))]
     assert bands == sorted(bands)
@@ -129,7 +184,9 @@ def test_a_ping_depends_on_its_generator_alone():
 def test_speckle_is_fully_developed():
     # Pixels are the fourth root of an exponential power: Weibull of shape 4, whose coefficient of
     # variation is sqrt(Gamma(1.5) / Gamma(1.25)^2 - 1) = 0.2805 and whose skewness is -0.087.
-    config = SonarConfig(seabed_db=-80.0, noise_db=0.0, saturation_db=20.0)
+    config = SonarConfig(
+        seabed_db=-80.0, reverberation_db=-90.0, ring_db=-90.0, noise_db=0.0, saturation_db=20.0
+    )
     sonar = simulator(config=config)
     rng = np.random.default_rng(0)
     pixels = np.concatenate(
@@ -175,6 +232,8 @@ def test_speckle_is_that_of_a_real_sonar():
         beam_width_rad=math.radians(0.36),
         pulse_length_m=0.003,
         seabed_db=-80.0,
+        reverberation_db=-90.0,
+        ring_db=-90.0,
         noise_db=-20.0,
     )
     sonar = simulator(config=config)

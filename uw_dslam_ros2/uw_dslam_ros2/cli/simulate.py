@@ -11,6 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from uw_dslam_ros2.core.errors import UwDslamError
+from uw_dslam_ros2.sim.instruments import HEADING_SOURCES
 from uw_dslam_ros2.sim.mission import MissionConfig
 from uw_dslam_ros2.sim.places import PLACES
 from uw_dslam_ros2.sim.recording import simulate_mission
@@ -38,7 +39,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--beams", type=int, default=default.sonar.num_beams)
     parser.add_argument("--ranges", type=int, default=default.sonar.num_ranges, help="range bins")
     parser.add_argument("--max-range", type=float, default=default.sonar.max_range_m, metavar="M")
-    parser.add_argument("--speed", type=float, default=default.navigation.speed_m_s, metavar="M/S")
+    parser.add_argument("--speed", type=float, default=default.drive.speed_m_s, metavar="M/S")
+    parser.add_argument("--heading", choices=HEADING_SOURCES, default="gyro")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
     parser.add_argument(
         "--processes", type=int, default=os.cpu_count() or 1, help="the result is the same"
@@ -62,7 +64,8 @@ def _config(arguments: argparse.Namespace) -> MissionConfig:
             num_ranges=arguments.ranges,
             max_range_m=arguments.max_range,
         ),
-        navigation=replace(default.navigation, speed_m_s=arguments.speed),
+        drive=replace(default.drive, speed_m_s=arguments.speed),
+        instruments=replace(default.instruments, heading_source=arguments.heading),
     )
 
 

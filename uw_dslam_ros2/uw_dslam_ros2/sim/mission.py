@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import SonarImage
+from uw_dslam_ros2.sim.clutter import ClutterConfig, MovingClutter
+from uw_dslam_ros2.sim.instruments import InstrumentConfig, NavigationLog, measure
 from uw_dslam_ros2.sim.paths import SurveyArea, plan_survey, split_areas
 from uw_dslam_ros2.sim.places import PLACES, make_place
 from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
-from uw_dslam_ros2.sim.vehicle import Motion, NavigationConfig, NavigationLog, drive, measure
+from uw_dslam_ros2.sim.vehicle import DriveConfig, Motion, drive
 from uw_dslam_ros2.sim.world import World
 
 __all__ = [
@@ -58,7 +60,9 @@ class MissionConfig(Config):
     ping_rate_hz: float = setting(3.0, 0.2, 30.0, "sonar pings per second")
     truth_resolution_m: float = setting(0.05, 0.01, 2.0, "cell size of the true map [m]")
     sonar: SonarConfig = setting(SonarConfig())
-    navigation: NavigationConfig = setting(NavigationConfig())
+    drive: DriveConfig = setting(DriveConfig())
+    instruments: InstrumentConfig = setting(InstrumentConfig())
+    clutter: ClutterConfig = setting(ClutterConfig())
 
 
 def tiny_mission_config(seed: int = 0) -> MissionConfig:
@@ -72,23 +76,30 @@ def tiny_mission_config(seed: int = 0) -> MissionConfig:
         ping_rate_hz=2.0,
         truth_resolution_m=0.1,
         sonar=SonarConfig(num_beams=128, num_ranges=200),
-        navigation=NavigationConfig(speed_m_s=1.5),
+        drive=DriveConfig(speed_m_s=1.5),
+        clutter=ClutterConfig(num_schools=1, num_bubble_clouds=1),
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleRun:
-    """One vehicle's part of a mission; ``ping_motion`` is the motion at the times of the pings."""
+    """One vehicle's part of a mission; ``ping_motion`` is the motion at the times of the pings.
+
+    ``range_scale`` and ``T_base_sonar`` are the sonar's true ones; the recording says 1 and
+    `T_BASE_SONAR`.
+    """
 
     vehicle_id: str
     area: SurveyArea
     motion: Motion
     navigation: NavigationLog
     ping_motion: Motion
+    range_scale: float
+    T_base_sonar: SE2
 
     def sonar_poses(self) -> NDArray[np.float64]:
         """True poses (K, 3) [x, y, yaw] of the sonar in the world at its pings."""
-        poses = [self.ping_motion.pose(i) @ T_BASE_SONAR for i in range(self.num_pings)]
+        poses = [self.ping_motion.pose(i) @ self.T_base_sonar for i in range(self.num_pings)]
         return np.array([pose.as_array() for pose in poses])
 
     @property
@@ -117,15 +128,24 @@ def plan_mission(config: MissionConfig) -> Mission:
 def _run(config: MissionConfig, world: World, area: SurveyArea, index: int) -> VehicleRun:
     rng = np.random.default_rng([config.seed, 10, index])
     # Bends cost time: a route for the cruising speed is always long enough.
-    length_m = 1.2 * config.navigation.speed_m_s * config.duration_s + 20.0
+    length_m = 1.2 * config.drive.speed_m_s * config.duration_s + 20.0
     route = plan_survey(world, area, length_m, config.clearance_m, rng)
     # Vehicles do not start at the same moment.
     start_ns = _START_NS + index * 370_000_000
-    motion = drive(route, start_ns, config.duration_s, config.navigation, rng)
-    log = measure(motion, config.navigation, T_BASE_DVL, rng)
+    motion = drive(route, start_ns, config.duration_s, config.drive, rng)
+    log = measure(motion, config.instruments, T_BASE_DVL, rng, world)
     first = start_ns + int(rng.integers(50_000_000, 150_000_000))
     pings = np.arange(first, motion.stamp_ns[-1], round(_NS / config.ping_rate_hz))
-    return VehicleRun(f"auv_{index + 1}", area, motion, log, motion.at(pings))
+    sonar = config.sonar
+    return VehicleRun(
+        vehicle_id=f"auv_{index + 1}",
+        area=area,
+        motion=motion,
+        navigation=log,
+        ping_motion=motion.at(pings),
+        range_scale=1.0 + float(rng.normal(0.0, sonar.sound_speed_sigma)),
+        T_base_sonar=T_BASE_SONAR @ SE2(yaw=float(rng.normal(0.0, sonar.misalignment_rad))),
+    )
 
 
 class PingMaker:
@@ -133,17 +153,23 @@ class PingMaker:
 
     def __init__(self, mission: Mission) -> None:
         self._mission = mission
-        self._sonar = SonarSimulator(mission.world, mission.config.sonar)
+        self._sonars = [
+            SonarSimulator(mission.world, mission.config.sonar, run.range_scale)
+            for run in mission.runs
+        ]
+        self._clutter = MovingClutter(mission.world, mission.config.clutter)
 
     def ping(self, vehicle: int, index: int) -> SonarImage:
         """Return the image of one ping."""
-        motion = self._mission.runs[vehicle].ping_motion
+        run = self._mission.runs[vehicle]
+        motion, stamp_ns = run.ping_motion, int(run.ping_motion.stamp_ns[index])
         rng = np.random.default_rng([self._mission.config.seed, 20, vehicle, index])
-        return self._sonar.ping(
-            int(motion.stamp_ns[index]),
-            motion.pose(index) @ T_BASE_SONAR,
+        return self._sonars[vehicle].ping(
+            stamp_ns,
+            motion.pose(index) @ run.T_base_sonar,
             float(motion.depth_m[index]),
             rng,
+            self._clutter.at((stamp_ns - _START_NS) / _NS),
         )
 
     def pings(self, vehicle: int, indices: range) -> Iterator[SonarImage]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import math
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -18,11 +16,9 @@ from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import OCCUPIED, OccupancyMap
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.maps import write_map
-from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.recordings import BagWriter
 from uw_dslam_ros2.io.trajectories import write_tum
 from uw_dslam_ros2.sim.mission import (
-    T_BASE_DVL,
     T_BASE_SONAR,
     Mission,
     MissionConfig,
@@ -32,19 +28,11 @@ from uw_dslam_ros2.sim.mission import (
     plan_mission,
 )
 from uw_dslam_ros2.sim.raster import grid_over, seen_map
+from uw_dslam_ros2.sim.recorder import TRUTH_STEP, VehicleRecorder
 
 __all__ = ["RecordedMission", "read_mission", "simulate_mission"]
 
 _CHUNK_PINGS = 40
-_FREQUENCY_HZ = 1.2e6
-_SOUND_SPEED_M_S = 1500.0
-_TRUTH_RATE_STEP = 5  # every fifth of 50 samples per second
-
-# Quaternions [x, y, z, w] of frames in base_link: the sonar's z forward, x up, y to starboard;
-# the DVL's x forward, z down.
-_SONAR_ROTATION = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
-_DVL_ROTATION = (1.0, 0.0, 0.0, 0.0)
-_NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 Progress = Callable[[int, int], None]
 """Called with pings done and pings in all."""
@@ -94,7 +82,7 @@ def simulate_mission(
     with _ping_source(mission, num_processes) as images:
         for vehicle, run in enumerate(mission.runs):
             with BagWriter(folder / run.vehicle_id, storage) as writer:
-                recorder = _Recorder(writer, run, config)
+                recorder = VehicleRecorder(writer, run, mission)
                 for image in images(vehicle, run.num_pings):
                     recorder.write_until(image.stamp_ns)
                     recorder.write_image(image)
@@ -160,111 +148,6 @@ def _make_chunk(vehicle: int, start: int, stop: int) -> list[SonarImage]:
     return list(_worker[0].pings(vehicle, range(start, stop)))
 
 
-class _Recorder:
-    """Writes one vehicle's bag in order of time."""
-
-    def __init__(self, writer: BagWriter, run: VehicleRun, config: MissionConfig) -> None:
-        self._writer = writer
-        self._make = MessageFactory(writer.typestore)
-        self._run = run
-        self._config = config
-        self._altitude_m = 5.0
-        who = run.vehicle_id
-        self._base, self._sonar = f"{who}/base_link", f"{who}/sonar"
-        writer.add_topic("/tf_static", "tf2_msgs/msg/TFMessage", is_latched=True)
-        writer.add_topic(f"/{who}/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
-        writer.add_topic(f"/{who}/imu", "sensor_msgs/msg/Imu")
-        writer.add_topic(f"/{who}/dvl", "marine_acoustic_msgs/msg/Dvl")
-        writer.add_topic(f"/{who}/depth", "sensor_msgs/msg/FluidPressure")
-        writer.add_topic(f"/{who}/truth/odom", "nav_msgs/msg/Odometry")
-        start_ns = int(run.motion.stamp_ns[0])
-        self._writer.write("/tf_static", start_ns, self._mounts(start_ns))
-        log = run.navigation
-        events = itertools.chain(
-            ((int(t), 0, i) for i, t in enumerate(log.imu_stamp_ns)),
-            ((int(t), 1, i) for i, t in enumerate(log.dvl_stamp_ns)),
-            ((int(t), 2, i) for i, t in enumerate(log.depth_stamp_ns)),
-            (
-                (int(run.motion.stamp_ns[i]), 3, i)
-                for i in range(0, len(run.motion.stamp_ns), _TRUTH_RATE_STEP)
-            ),
-        )
-        self._pending = sorted(events, reverse=True)
-        self._writers = (self._write_imu, self._write_dvl, self._write_depth, self._write_truth)
-
-    def _mounts(self, stamp_ns: int) -> Any:
-        who = self._run.vehicle_id
-        mounts = [
-            (f"{who}/sonar", (T_BASE_SONAR.x, T_BASE_SONAR.y, -0.10), _SONAR_ROTATION),
-            (f"{who}/dvl", (T_BASE_DVL.x, T_BASE_DVL.y, -0.15), _DVL_ROTATION),
-            (f"{who}/imu", (0.0, 0.0, 0.0), _NO_ROTATION),
-            (f"{who}/depth", (0.0, 0.0, 0.0), _NO_ROTATION),
-        ]
-        return self._make.transforms(stamp_ns, self._base, mounts)
-
-    def write_until(self, stamp_ns: int | None) -> None:
-        """Write everything but images up to a time; None means all that is left."""
-        while self._pending and (stamp_ns is None or self._pending[-1][0] <= stamp_ns):
-            stamp, kind, index = self._pending.pop()
-            self._writers[kind](stamp, index)
-
-    def write_image(self, image: SonarImage) -> None:
-        """Write one ping."""
-        message = self._make.sonar_image(
-            self._sonar,
-            image,
-            beam_width_rad=self._config.sonar.beam_width_rad,
-            frequency_hz=_FREQUENCY_HZ,
-            sound_speed_m_s=_SOUND_SPEED_M_S,
-        )
-        self._writer.write(f"/{self._run.vehicle_id}/sonar", image.stamp_ns, message)
-
-    def _write_imu(self, stamp_ns: int, index: int) -> None:
-        log, navigation = self._run.navigation, self._config.navigation
-        message = self._make.imu(
-            stamp_ns,
-            f"{self._run.vehicle_id}/imu",
-            float(log.yaw_rad[index]),
-            navigation.yaw_noise_rad**2,
-            float(log.yaw_rate_rad_s[index]),
-            navigation.gyro_noise_rad_s**2,
-        )
-        self._writer.write(f"/{self._run.vehicle_id}/imu", stamp_ns, message)
-
-    def _write_dvl(self, stamp_ns: int, index: int) -> None:
-        velocity = self._run.navigation.dvl_velocity_m_s[index]
-        message = self._make.dvl(
-            stamp_ns,
-            f"{self._run.vehicle_id}/dvl",
-            velocity if np.isfinite(velocity).all() else None,
-            self._config.navigation.dvl_noise_m_s**2,
-            self._altitude_m,
-        )
-        self._writer.write(f"/{self._run.vehicle_id}/dvl", stamp_ns, message)
-
-    def _write_depth(self, stamp_ns: int, index: int) -> None:
-        message = self._make.pressure(
-            stamp_ns,
-            f"{self._run.vehicle_id}/depth",
-            float(self._run.navigation.depth_m[index]),
-            self._config.navigation.depth_noise_m,
-        )
-        self._writer.write(f"/{self._run.vehicle_id}/depth", stamp_ns, message)
-
-    def _write_truth(self, stamp_ns: int, index: int) -> None:
-        motion = self._run.motion
-        message = self._make.odometry(
-            stamp_ns,
-            "map",
-            self._base,
-            motion.pose(index),
-            float(motion.depth_m[index]),
-            motion.velocity_m_s[index],
-            float(motion.yaw_rate_rad_s[index]),
-        )
-        self._writer.write(f"/{self._run.vehicle_id}/truth/odom", stamp_ns, message)
-
-
 def _write_truth(folder: Path, mission: Mission) -> None:
     """Everything that a recording of the real world would not have, and `mission.json`."""
     config, world = mission.config, mission.world
@@ -279,8 +162,8 @@ def _write_truth(folder: Path, mission: Mission) -> None:
         motion = run.motion
         write_tum(
             folder / f"{run.vehicle_id}.tum",
-            motion.stamp_ns[::_TRUTH_RATE_STEP],
-            motion.poses[::_TRUTH_RATE_STEP],
+            motion.stamp_ns[::TRUTH_STEP],
+            motion.poses[::TRUTH_STEP],
         )
     outline = {
         "frame": "map",
@@ -310,6 +193,8 @@ def _vehicle_summary(run: VehicleRun) -> dict[str, Any]:
         "stop_ns": int(run.motion.stamp_ns[-1]),
         "path_length_m": round(float(steps.sum()), 2),
         "num_pings": run.num_pings,
+        "sonar_range_scale": run.range_scale,
+        "sonar_yaw_error_rad": run.T_base_sonar.yaw - T_BASE_SONAR.yaw,
     }
 
 

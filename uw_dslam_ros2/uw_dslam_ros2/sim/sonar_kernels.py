@@ -24,17 +24,18 @@ def add_echoes(
     widths: FloatArray,
     tails: FloatArray,
     response: Float32Array,
-    first_ray_offset_rad: float,
+    offsets_rad: FloatArray,
     ray_step_rad: float,
     beam_step_rad: float,
     bin_m: float,
     num_near: int,
 ) -> None:
-    """Add each ray's echo to every beam that hears it.
+    """Add each echo to every beam that hears it.
 
-    ``power`` (B, R). Rays (K,) lie `ray_step_rad` apart, the first one `first_ray_offset_rad` to
-    port of the first beam. An echo fills `widths` [m] of range evenly and then decays over
-    `tails`. ``response`` (L,) by ray steps off the axis; beyond `num_near` steps it is left out.
+    ``power`` (B, R). Echoes (K,) lie `offsets_rad` to port of the first beam; beams lie
+    `beam_step_rad` apart, each to starboard of the one before. An echo fills `widths` [m] of range
+    evenly and then decays over `tails` [m]. ``response`` (L,) by steps of `ray_step_rad` off a
+    beam's axis; beyond `num_near` steps it is left out.
     """
     num_beams, num_ranges = power.shape
     shape = np.empty(_MAX_BINS, dtype=np.float32)
@@ -56,9 +57,8 @@ def add_echoes(
             if tail > 0.0 and behind > 0.0:
                 value += 0.25 * math.exp(-behind / tail)
             shape[b - first] = level * value
-        offset = first_ray_offset_rad - k * ray_step_rad
         for beam in range(num_beams):
-            steps = int(abs(offset + beam * beam_step_rad) / ray_step_rad + 0.5)
+            steps = int(abs(offsets_rad[k] + beam * beam_step_rad) / ray_step_rad + 0.5)
             if steps >= num_near or steps >= response.shape[0]:
                 continue
             gain = response[steps]
@@ -117,16 +117,18 @@ def filter_beams(noise: Float32Array, taps: Float32Array) -> Float32Array:
     """
     _, num_ranges, num_beams = noise.shape
     reach = taps.shape[0] // 2
-    result = np.empty((num_ranges, num_beams), dtype=np.float32)
+    edge_gain = np.empty(num_beams, dtype=np.float32)
     for beam in range(num_beams):
         total = np.float32(0.0)
         for k in range(max(-reach, -beam), min(reach, num_beams - 1 - beam) + 1):
             total += taps[k + reach] * taps[k + reach]
-        edge_gain = np.float32(0.5) / total
-        for r in range(num_ranges):
+        edge_gain[beam] = np.float32(0.5) / total
+    result = np.empty((num_ranges, num_beams), dtype=np.float32)
+    for r in range(num_ranges):
+        for beam in range(num_beams):
             real, imaginary = np.float32(0.0), np.float32(0.0)
             for k in range(max(-reach, -beam), min(reach, num_beams - 1 - beam) + 1):
                 real += taps[k + reach] * noise[0, r, beam + k]
                 imaginary += taps[k + reach] * noise[1, r, beam + k]
-            result[r, beam] = (real * real + imaginary * imaginary) * edge_gain
+            result[r, beam] = (real * real + imaginary * imaginary) * edge_gain[beam]
     return result

@@ -1,4 +1,4 @@
-"""A vehicle on its route, and what its navigation instruments say about that."""
+"""A vehicle on its route."""
 
 from __future__ import annotations
 
@@ -14,47 +14,24 @@ from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["Motion", "NavigationConfig", "NavigationLog", "drive", "measure"]
+__all__ = ["DriveConfig", "Motion", "drive"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _NS = 1_000_000_000
-_DEG_PER_HOUR = math.radians(1.0) / 3600.0
+_MAX_CRAB = 0.5  # sine of the angle at which the vehicle gives in to the current
 
 
 @dataclass(frozen=True, slots=True)
-class NavigationConfig(Config):
-    """Motion and navigation instruments; the defaults resemble a small inspection vehicle.
-
-    Gyro figures as in data sheets of MEMS units with temperature calibration, DVL figures as
-    those of a Water Linked A50 (1 % of the velocity), pressure of a Keller or Bar30 sensor.
-    """
+class DriveConfig(Config):
+    """How a vehicle moves; the defaults resemble a small inspection vehicle."""
 
     speed_m_s: float = setting(1.0, 0.1, 3.0, "cruising speed [m/s]")
     max_yaw_rate_rad_s: float = setting(0.3, 0.02, 2.0, "it slows down in bends for this [rad/s]")
     depth_m: float = setting(3.0, 0.5, 100.0, "cruising depth [m]")
-    imu_rate_hz: float = setting(25.0, 1.0, 400.0, "IMU messages per second")
-    yaw_noise_rad: float = setting(math.radians(0.15), 0.0, 0.5, "white noise of the yaw [rad]")
-    gyro_noise_rad_s: float = setting(1.0e-3, 0.0, 0.1, "white noise of the yaw rate [rad/s]")
-    gyro_bias_deg_h: float = setting(
-        20.0, 0.0, 1000.0, "sigma of the gyro's bias at the start, in both yaw and rate [deg/h]"
-    )
-    gyro_bias_walk_deg_h: float = setting(
-        15.0, 0.0, 1000.0, "sigma of the bias' change in an hour of random walk [deg/h]"
-    )
-    angle_walk_deg_sqrt_h: float = setting(
-        0.3, 0.0, 20.0, "angle random walk of the yaw [deg / sqrt(h)]"
-    )
-    dvl_rate_hz: float = setting(6.0, 0.5, 50.0, "DVL messages per second")
-    dvl_noise_m_s: float = setting(0.006, 0.0, 0.5, "white noise of each velocity [m/s]")
-    dvl_scale_sigma: float = setting(0.007, 0.0, 0.1, "sigma of the scale error, 1")
-    dvl_bias_m_s: float = setting(0.001, 0.0, 0.1, "sigma of each velocity's bias [m/s]")
-    dvl_misalignment_rad: float = setting(
-        math.radians(0.3), 0.0, 0.2, "sigma of the mounting angle's error [rad]"
-    )
-    depth_rate_hz: float = setting(5.0, 0.5, 50.0, "pressure messages per second")
-    depth_noise_m: float = setting(0.01, 0.0, 1.0, "white noise of the depth [m]")
+    current_m_s: float = setting(0.1, 0.0, 1.0, "speed of the water over ground [m/s]")
+    current_yaw_rad: float = setting(0.7, -math.pi, math.pi, "where the water flows to [rad]")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,11 +73,11 @@ def drive(
     route: FloatArray,
     start_ns: int,
     duration_s: float,
-    config: NavigationConfig,
+    config: DriveConfig,
     rng: np.random.Generator,
     rate_hz: float = 50.0,
 ) -> Motion:
-    """Follow a route (N, 2) [m] for some time; slower in bends, crabbing a little.
+    """Follow a route (N, 2) [m] for some time; slower in bends, its bow into the current.
 
     Raises
     ------
@@ -121,6 +98,7 @@ def drive(
     progress = gaussian_filter1d(progress, 0.5 * rate_hz, mode="nearest")
     x, y = CubicSpline(s, route, axis=0)(progress).T
     crab = 0.04 * np.sin(2.0 * math.pi * t / rng.uniform(11.0, 19.0) + rng.uniform(0.0, 6.0))
+    crab += _crab_angle(np.interp(progress, s, headings), config)
     yaw = crab + gaussian_filter1d(np.interp(progress, s, headings), 0.3 * rate_hz, mode="nearest")
     v_world = np.gradient(np.column_stack([x, y]), 1.0 / rate_hz, axis=0)
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -136,8 +114,14 @@ def drive(
     )
 
 
+def _crab_angle(headings: FloatArray, config: DriveConfig) -> FloatArray:
+    """Angle (K,) [rad] by which the bow turns into the current, so that the course is held."""
+    across = config.current_m_s * np.sin(config.current_yaw_rad - headings)
+    return -np.arcsin(np.clip(across / config.speed_m_s, -_MAX_CRAB, _MAX_CRAB))
+
+
 def _profile(
-    route: FloatArray, config: NavigationConfig, rng: np.random.Generator
+    route: FloatArray, config: DriveConfig, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Arc length (N,) [m], heading (N,) [rad] and speed (N,) [m/s] along a route.
 
@@ -155,71 +139,3 @@ def _profile(
     window = math.ceil(0.5 / s[1])
     speeds = minimum_filter1d(speeds, 4 * window + 1, mode="nearest")
     return s, headings, gaussian_filter1d(speeds, window, truncate=2.0, mode="nearest")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NavigationLog:
-    """What the instruments said. The yaw's zero is the instrument's own, unlike any other's.
-
-    ``dvl_velocity_m_s`` (K, 2) in FLU axes at the instrument; NaN where bottom lock was lost.
-    """
-
-    imu_stamp_ns: IntArray
-    yaw_rad: FloatArray
-    yaw_rate_rad_s: FloatArray
-    dvl_stamp_ns: IntArray
-    dvl_velocity_m_s: FloatArray
-    depth_stamp_ns: IntArray
-    depth_m: FloatArray
-
-
-def measure(
-    motion: Motion,
-    config: NavigationConfig,
-    T_base_dvl: SE2,
-    rng: np.random.Generator,
-) -> NavigationLog:
-    """Sample all instruments along a motion, each with its own clock and errors."""
-    imu = motion.at(_stamps(motion, config.imu_rate_hz, 0))
-    yaw, yaw_rate = _imu_readings(imu, config, rng)
-    dvl = motion.at(_stamps(motion, config.dvl_rate_hz, 13_000_000))
-    lever = np.column_stack(
-        [-T_base_dvl.y * dvl.yaw_rate_rad_s, T_base_dvl.x * dvl.yaw_rate_rad_s]
-    )
-    misalignment = SE2(yaw=rng.normal(0.0, config.dvl_misalignment_rad))
-    at_sensor = (T_base_dvl @ misalignment).inverse().rotation() @ (dvl.velocity_m_s + lever).T
-    scale = 1.0 + rng.normal(0.0, config.dvl_scale_sigma)
-    bias = rng.normal(0.0, config.dvl_bias_m_s, 2)
-    noise = rng.normal(0.0, config.dvl_noise_m_s, dvl.velocity_m_s.shape)
-    depth = motion.at(_stamps(motion, config.depth_rate_hz, 29_000_000))
-    return NavigationLog(
-        imu_stamp_ns=imu.stamp_ns,
-        yaw_rad=yaw,
-        yaw_rate_rad_s=yaw_rate,
-        dvl_stamp_ns=dvl.stamp_ns,
-        dvl_velocity_m_s=scale * at_sensor.T + bias + noise,
-        depth_stamp_ns=depth.stamp_ns,
-        depth_m=depth.depth_m + rng.normal(0.0, config.depth_noise_m, len(depth.depth_m)),
-    )
-
-
-def _stamps(motion: Motion, rate_hz: float, phase_ns: int) -> IntArray:
-    first, last = int(motion.stamp_ns[0]) + phase_ns, int(motion.stamp_ns[-1])
-    return np.arange(first, last, round(_NS / rate_hz), dtype=np.int64)
-
-
-def _imu_readings(
-    imu: Motion, config: NavigationConfig, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Yaw and yaw rate: one bias drives both, the yaw integrates it from an unknown start."""
-    dt = 1.0 / config.imu_rate_hz
-    count = len(imu.stamp_ns)
-    offset = rng.uniform(-math.pi, math.pi)
-    walk = config.gyro_bias_walk_deg_h * math.sqrt(dt / 3600.0)
-    bias_deg_h = rng.normal(0.0, config.gyro_bias_deg_h) + np.cumsum(rng.normal(0.0, walk, count))
-    bias = bias_deg_h * _DEG_PER_HOUR
-    angle_walk = math.radians(config.angle_walk_deg_sqrt_h) * math.sqrt(dt / 3600.0)
-    drift = np.cumsum(bias * dt + rng.normal(0.0, angle_walk, count))
-    yaw = imu.poses[:, 2] + offset + drift + rng.normal(0.0, config.yaw_noise_rad, count)
-    rate = imu.yaw_rate_rad_s + bias + rng.normal(0.0, config.gyro_noise_rad_s, count)
-    return yaw, rate
