@@ -49,3 +49,29 @@ def test_output_that_cannot_be_written_is_an_error(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["convergence", "--out", str(tmp_path / "file" / "below")]) == 1
     assert "cannot write" in capsys.readouterr().err
+
+
+def test_outliers_writes_trials_that_agree_with_its_summary(tmp_path, capsys):
+    methods = ["--methods", "engine", "true pairs", "ICP"]
+    arguments = ["--only", "paper", "--points", "15", "--trials", "2", *methods]
+    assert main(["outliers", "--out", str(tmp_path), *arguments]) == 0
+    with (tmp_path / "outliers.csv").open() as file:
+        trials = list(csv.DictReader(file))
+    with (tmp_path / "summary.csv").open() as file:
+        summary = list(csv.DictReader(file))
+    assert len(trials) == 4 * 2 * 3
+    for row in summary:
+        own = [t for t in trials if all(t[k] == row[k] for k in ("outliers", "noise_m", "method"))]
+        assert len(own) == 2
+        assert float(row["success"]) == sum(int(t["success"]) for t in own) / 2
+    # Without noise the limit is exact.
+    for trial in trials:
+        if trial["method"] == "true pairs" and trial["noise_m"] == "0.0":
+            assert float(trial["error_deg"]) < 1e-9
+    assert (tmp_path / "figure4.png").exists()
+    assert "the paper" in capsys.readouterr().out
+
+
+def test_outliers_refuses_an_unknown_method(tmp_path, capsys):
+    assert main(["outliers", "--out", str(tmp_path), "--methods", "magic"]) == 1
+    assert "magic" in capsys.readouterr().err
