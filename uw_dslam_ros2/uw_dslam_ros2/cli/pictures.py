@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -13,9 +14,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.outcome import Outcome, Trajectory
@@ -64,41 +67,110 @@ def png_bytes(figure: Figure, dpi: int = 110) -> bytes:
 def before_after(outcome: Outcome, title: str) -> Figure:
     """Each vehicle's map by itself, and the one map of all, with ways and seams."""
     colors = vehicle_colors([v.vehicle_id for v in outcome.vehicles])
-    num = len(outcome.vehicles)
-    figure = _figure(14.0, max(7.0, 2.9 * num))
-    outer = figure.add_gridspec(
-        1, 2, width_ratios=(1.0, 2.3), left=0.015, right=0.985, top=0.90, bottom=0.06, wspace=0.05
-    )
-    inner = outer[0].subgridspec(num, 1, hspace=0.16)
-    for index, vehicle in enumerate(outcome.vehicles):
-        axes = figure.add_subplot(inner[index])
-        _show_map(axes, vehicle.own_map, crop=True)
+    own = [_extent_m(vehicle.own_map) for vehicle in outcome.vehicles]
+    merged = (1.0, 1.0) if outcome.global_map is None else _extent_m(outcome.global_map)
+    layout = _Layout.of(own, merged)
+    figure = _figure(layout.width, layout.height)
+    for vehicle, box in zip(outcome.vehicles, layout.small, strict=True):
+        axes = figure.add_axes(layout.share(box))
+        _show_map(axes, vehicle.own_map)
         _draw_way(axes, vehicle.own_trajectory, colors[vehicle.vehicle_id])
         _scale_bar(axes)
-        state = "" if vehicle.is_merged else "  (not merged)"
-        axes.set_title(
-            f"{vehicle.vehicle_id} alone{state}", fontsize=10, loc="left", color=_INK, pad=4
-        )
-    axes = figure.add_subplot(outer[1])
-    _show_merged(axes, outcome, colors)
-    figure.suptitle(title, x=0.015, y=0.975, ha="left", fontsize=15, color=_INK, weight="bold")
+        _title(axes, f"{vehicle.vehicle_id} alone", "" if vehicle.is_merged else "not merged")
+    _show_merged(figure.add_axes(layout.share(layout.large)), outcome, colors)
+    figure.text(
+        _GAP / layout.width,
+        1.0 - 0.22 / layout.height,
+        title,
+        ha="left",
+        va="top",
+        fontsize=16,
+        color=_INK,
+        weight="bold",
+    )
     return figure
+
+
+_Box = tuple[float, float, float, float]
+_GAP, _HEAD, _TITLE, _FOOT = 0.25, 0.75, 0.32, 0.42  # inches
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Places of the pictures in inches from the lower left; all small ones have one scale."""
+
+    width: float
+    height: float
+    small: tuple[_Box, ...]
+    large: _Box
+
+    def share(self, box: _Box) -> _Box:
+        """As matplotlib takes it."""
+        return (
+            box[0] / self.width,
+            box[1] / self.height,
+            box[2] / self.width,
+            box[3] / self.height,
+        )
+
+    @classmethod
+    def of(cls, own: Sequence[tuple[float, float]], merged: tuple[float, float]) -> _Layout:
+        """Put small pictures of maps (width, height) in metres beside or above the large one."""
+        return (cls._beside if merged[0] < 1.5 * merged[1] else cls._above)(own, merged)
+
+    @classmethod
+    def _beside(cls, own: Sequence[tuple[float, float]], merged: tuple[float, float]) -> _Layout:
+        height = 8.2  # of the large picture
+        titles = _TITLE * (len(own) - 1)
+        scale = (height - titles) / sum(h for _, h in own)
+        column = max(w for w, _ in own) * scale
+        if column > 4.6:
+            scale *= 4.6 / column
+            column = 4.6
+        top = _FOOT + height
+        boxes: list[_Box] = []
+        free = height - titles - scale * sum(h for _, h in own)
+        for w, h in own:
+            bottom = top - h * scale
+            boxes.append((_GAP, bottom, w * scale, h * scale))
+            top = bottom - _TITLE - free / max(1, len(own) - 1)
+        width = height * merged[0] / merged[1]
+        left = 2.5 * _GAP + max(column, 1.9)
+        large = (left, _FOOT, width, height)
+        return cls(
+            max(left + width + _GAP, left + 6.2), height + _FOOT + _HEAD, tuple(boxes), large
+        )
+
+    @classmethod
+    def _above(cls, own: Sequence[tuple[float, float]], merged: tuple[float, float]) -> _Layout:
+        width = 12.5  # of the large picture
+        height = width * merged[1] / merged[0]
+        gaps = 2.0 * _GAP * (len(own) - 1)
+        scale = min((width - gaps) / sum(w for w, _ in own), 4.2 / max(h for _, h in own))
+        row = scale * max(h for _, h in own)
+        left, boxes = _GAP, []
+        gap = (width - scale * sum(w for w, _ in own)) / max(1, len(own) - 1)
+        bottom = _FOOT + height + _TITLE + _GAP
+        for w, h in own:
+            boxes.append((left, bottom + row - h * scale, w * scale, h * scale))
+            left += w * scale + min(gap, 4.0 * _GAP)
+        large = (_GAP, _FOOT, width, height)
+        return cls(width + 2.0 * _GAP, bottom + row + _HEAD, tuple(boxes), large)
 
 
 def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str]) -> None:
     merged = [v for v in outcome.vehicles if v.is_merged]
-    axes.set_title(
-        f"One map: {len(merged)} of {len(outcome.vehicles)} vehicles merged",
-        fontsize=10,
-        loc="left",
-        color=_INK,
-        pad=4,
+    left = [v.vehicle_id for v in outcome.vehicles if not v.is_merged]
+    _title(
+        axes,
+        f"one map: {len(merged)} of {len(outcome.vehicles)} vehicles",
+        f"not merged: {', '.join(left)}" if left else "",
     )
     if outcome.global_map is None:
         axes.text(0.5, 0.5, "nothing was merged", ha="center", transform=axes.transAxes)
         axes.set_axis_off()
         return
-    _show_map(axes, outcome.global_map, crop=True)
+    _show_map(axes, outcome.global_map)
     for record in outcome.records:
         if record.state is SubmapState.MERGED:
             _draw_seam(
@@ -114,7 +186,7 @@ def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str]) -> Non
             _draw_way(axes, vehicle.trajectory, color)
             handles.append(Line2D([], [], color=color, lw=2, label=vehicle.vehicle_id))
     handles += [
-        Line2D([], [], color="#555555", lw=1, ls=(0, (1, 1.5)), label="seam of a submap"),
+        Line2D([], [], color="#555555", lw=1.2, ls=(0, (1, 1.5)), label="seam of a submap"),
         *_shade_handles(),
     ]
     _scale_bar(axes)
@@ -138,8 +210,7 @@ def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure |
     picture[(true > 50) & ~near_found] = _MISSING
     picture[(found > 50) & near_true] = _AGREE
     picture[(found > 50) & ~near_true] = _EXTRA
-    figure = _figure(10.0, 7.6)
-    axes = figure.add_axes((0.02, 0.09, 0.96, 0.85))
+    figure, axes = _single(spec)
     _show_picture(axes, picture, spec)
     _scale_bar(axes)
     _legend_below(
@@ -150,7 +221,7 @@ def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure |
             Patch(color=_MISSING, label="true wall that was missed"),
         ],
     )
-    axes.set_title("The merged map against the true one", loc="left", fontsize=11, color=_INK)
+    _title(axes, "the merged map against the true one")
     return figure
 
 
@@ -194,11 +265,10 @@ def overlay(
     picture[true > 50] = _MISSING
     picture[found > 50] = _EXTRA
     picture[both] = _AGREE
-    figure = _figure(9.0, 7.6)
-    axes = figure.add_axes((0.02, 0.10, 0.96, 0.83))
+    figure, axes = _single(spec)
     _show_picture(axes, picture, spec)
     _scale_bar(axes)
-    axes.set_title(title, loc="left", fontsize=11, color=_INK)
+    _title(axes, title)
     _legend_below(
         axes,
         [
@@ -221,7 +291,45 @@ def _figure(width: float, height: float) -> Figure:
     return figure
 
 
-def _show_map(axes: Axes, occupancy: OccupancyMap, *, crop: bool) -> None:
+def _single(spec: GridSpec) -> tuple[Figure, Axes]:
+    """Axes for one map, in a figure of its shape."""
+    corners = spec.corners()
+    wide, high = corners.max(axis=0) - corners.min(axis=0)
+    scale = min(10.5 / wide, 8.0 / high)
+    width, height = wide * scale, high * scale
+    total = (max(width, 6.4) + 2.0 * _GAP, height + _FOOT + 2.0 * _TITLE)
+    figure = _figure(*total)
+    box = (_GAP / total[0], _FOOT / total[1], width / total[0], height / total[1])
+    return figure, figure.add_axes(box)
+
+
+def _title(axes: Axes, text: str, warning: str = "") -> None:
+    axes.set_title(text, fontsize=10.5, loc="left", color=_INK, pad=4)
+    if warning:
+        axes.set_title(warning, fontsize=10.5, loc="right", color=_COLORS[1], pad=4, weight="bold")
+
+
+def _cropped(occupancy: OccupancyMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last (exclusive) cell of what is known, with a margin."""
+    seen = np.argwhere(occupancy.known)
+    if len(seen) == 0:
+        return np.zeros(2, np.int64), np.array(occupancy.spec.shape)
+    low = np.maximum(seen.min(axis=0) - _MARGIN_CELLS, 0)
+    high = np.minimum(seen.max(axis=0) + 1 + _MARGIN_CELLS, occupancy.spec.shape)
+    return low, high
+
+
+def _extent_m(occupancy: OccupancyMap) -> tuple[float, float]:
+    """Width and height of what `_show_map` shows."""
+    low, high = _cropped(occupancy)
+    resolution = occupancy.spec.resolution_m
+    box = np.array([[low[1], low[0]], [high[1], low[0]], [high[1], high[0]], [low[1], high[0]]])
+    corners = occupancy.spec.T_frame_grid.apply(box * resolution)
+    size = corners.max(axis=0) - corners.min(axis=0)
+    return float(size[0]), float(size[1])
+
+
+def _show_map(axes: Axes, occupancy: OccupancyMap) -> None:
     values = occupancy.values
     picture = np.empty((*values.shape, 3))
     picture[:] = _UNKNOWN
@@ -230,40 +338,42 @@ def _show_map(axes: Axes, occupancy: OccupancyMap, *, crop: bool) -> None:
     known = values != UNKNOWN
     shade = (1.0 - share) * _FREE + share * _WALL
     picture[known] = shade[known]
-    _show_picture(axes, picture, occupancy.spec, crop=known if crop else None)
+    _show_picture(axes, picture, occupancy.spec, *_cropped(occupancy))
 
 
 def _show_picture(
-    axes: Axes, picture: FloatArray, spec: GridSpec, crop: NDArray[np.bool_] | None = None
+    axes: Axes,
+    picture: FloatArray,
+    spec: GridSpec,
+    low: NDArray[np.int64] | None = None,
+    high: NDArray[np.int64] | None = None,
 ) -> None:
-    """Show cells as they lie; thin walls survive the reduction to the screen's pixels."""
-    rows, cols = picture.shape[:2]
-    low, high = np.zeros(2, int), np.array([rows, cols])
-    if crop is not None and crop.any():
-        seen = np.argwhere(crop)
-        low = np.maximum(seen.min(axis=0) - _MARGIN_CELLS, 0)
-        high = np.minimum(seen.max(axis=0) + 1 + _MARGIN_CELLS, high)
-        picture = picture[low[0] : high[0], low[1] : high[1]]
+    """Show cells, or those from `low` to `high`, as they lie; thin walls survive the reduction."""
+    low = np.zeros(2, np.int64) if low is None else low
+    high = np.array(spec.shape) if high is None else high
+    picture = picture[low[0] : high[0], low[1] : high[1]]
     factor = max(1, math.ceil(max(picture.shape[:2]) / _MAX_PIXELS))
-    size = np.array(picture.shape[:2])
     picture = _darkest(picture, factor)
     resolution = spec.resolution_m
-    extent = (
-        low[1] * resolution,
-        (low[1] + math.ceil(size[1] / factor) * factor) * resolution,
-        low[0] * resolution,
-        (low[0] + math.ceil(size[0] / factor) * factor) * resolution,
-    )
+    first = low * resolution
+    last = first + np.array(picture.shape[:2]) * factor * resolution
     origin = spec.T_frame_grid
     motion = Affine2D().rotate(origin.yaw).translate(origin.x, origin.y)
-    image = axes.imshow(picture, extent=extent, origin="lower", interpolation="nearest")
-    image.set_transform(motion + axes.transData)
-    corners = motion.transform(
-        [[extent[i], extent[j]] for i, j in ((0, 2), (1, 2), (1, 3), (0, 3))]
+    image = axes.imshow(
+        picture,
+        extent=(first[1], last[1], first[0], last[0]),
+        origin="lower",
+        interpolation="nearest",
+        aspect="auto",
     )
+    image.set_transform(motion + axes.transData)
+    end = high * resolution
+    box = [[first[1], first[0]], [end[1], first[0]], [end[1], end[0]], [first[1], end[0]]]
+    corners = motion.transform(box)
     axes.set_xlim(corners[:, 0].min(), corners[:, 0].max())
     axes.set_ylim(corners[:, 1].min(), corners[:, 1].max())
-    axes.set_aspect("equal")
+    axes.set_aspect("equal", anchor="SW")
+    axes.set_facecolor(_UNKNOWN)
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
@@ -311,37 +421,26 @@ def _draw_seam(axes: Axes, grid: OccupancyMap, T_map_submap: SE2, color: str) ->
 def _scale_bar(axes: Axes) -> None:
     """Draw a bar of a round length in the lower left corner."""
     (x_low, x_high), (y_low, y_high) = axes.get_xlim(), axes.get_ylim()
-    width, height = x_high - x_low, y_high - y_low
-    target = 0.22 * width
+    width = x_high - x_low
+    target = min(0.3 * width, 0.5 * (y_high - y_low))
     power = 10.0 ** math.floor(math.log10(target))
     length = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= target)
-    x, y = x_low + 0.03 * width, y_low + 0.03 * height
-    thick = 0.010 * max(height, 0.6 * width)
-    pad = 1.2 * thick
-    axes.add_patch(
-        Rectangle(
-            (x - pad, y - pad),
-            length + 2 * pad,
-            thick + 7.5 * pad,
-            color="white",
-            alpha=0.85,
-            lw=0,
-            zorder=5,
-        )
-    )
-    axes.add_patch(Rectangle((x, y), length, thick, color=_INK, lw=0, zorder=6))
-    axes.text(
-        x + 0.5 * length,
-        y + 1.6 * thick,
+    inches = axes.get_window_extent().width / axes.figure.dpi
+    bar = AnchoredSizeBar(
+        axes.transData,
+        length,
         f"{length:g} m",
-        ha="center",
-        va="bottom",
-        fontsize=8,
+        "lower left",
+        pad=0.35,
+        borderpad=0.5,
+        sep=3,
         color=_INK,
-        zorder=6,
+        size_vertical=0.04 * width / inches,
+        fontproperties=FontProperties(size=8),
     )
-    axes.set_xlim(x_low, x_high)
-    axes.set_ylim(y_low, y_high)
+    bar.patch.set(alpha=0.85, linewidth=0)
+    bar.set_zorder(6)
+    axes.add_artist(bar)
 
 
 def _shade_handles() -> list[Patch]:
