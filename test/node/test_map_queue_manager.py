@@ -176,7 +176,7 @@ def test_busy_server_is_asked_again(manage):
 @pytest.mark.parametrize("is_lost_by", ["death", "silence"])
 def test_lost_request_is_asked_again_of_another_server(manage, ros_context, is_lost_by):
     """The first server takes the question and never answers; it dies, or it stays silent."""
-    timeout_s = 1.0 if is_lost_by == "silence" else 1000.0
+    timeout_s = 8.0 if is_lost_by == "silence" else 1000.0
     silent = rclpy.create_node("silent", context=ros_context)  # nobody spins it
     silent.create_service(RegisterMaps, "~/register_maps", lambda _, response: response)
     with manage(has_server=False, request_timeout_s=timeout_s, **FAST) as (until, probe, _):

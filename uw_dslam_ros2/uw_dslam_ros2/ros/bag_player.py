@@ -89,7 +89,7 @@ class BagPlayer(Node):
         self._playing_pubs: dict[str, Publisher] = {}
         self._lags = _Lags(self._config.max_lag_s)
         self._last_clock_ns: int | None = None
-        self._num_published = 0
+        self.num_published = 0
         self.create_service(SetBool, "~/pause", self._on_pause)
         self._thread = threading.Thread(target=self._run, name="playback", daemon=True)
         self._thread.start()
@@ -157,7 +157,7 @@ class BagPlayer(Node):
         recorded_s = ((self._last_clock_ns or start_ns) - start_ns) * 1e-9
         word = "stopped" if self._is_stopped() else "done"
         return (
-            f"{word}: played {self._num_published} messages, "
+            f"{word}: played {self.num_published} messages, "
             f"{recorded_s:.1f} s of recording, in {seconds:.1f} s"
         )
 
@@ -225,7 +225,7 @@ class BagPlayer(Node):
         publisher = self._playing_pubs[raw.topic]
         publisher.publish(bytes(raw.data))
         self._lags.sent(vehicle, raw.stamp_ns)
-        self._num_published += 1
+        self.num_published += 1
         return True
 
     def _advance_clock(self, stamp_ns: int) -> None:

@@ -343,7 +343,6 @@ class SonarMapper(Node):
         self._is_finished = True
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is not None:
-            self._publish_odometry(stamp_ns)
             self._publish_map(stamp_ns)
         self._mapper_values = self._mapper.diagnostics()
         return (

@@ -1,0 +1,273 @@
+"""The mapper as a node: topics, frames, bad messages, a bag that loops."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped, TwistWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Imu, LaserScan
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+from uw_dslam_msgs.msg import Submap as SubmapMsg
+
+from uw_dslam_ros2.core.errors import ConfigError
+from uw_dslam_ros2.io.messages import stamp_of
+from uw_dslam_ros2.ros.conversions import occupancy_from_msg, stamp_to_msg, submap_from_msg
+from uw_dslam_ros2.ros.qos import LATCHED, STATIC_TF, SUBMAPS
+from uw_dslam_ros2.ros.sonar_mapper import SonarMapper
+
+pytestmark = pytest.mark.ros
+
+START_NS = 1_000_000_000_000
+SPEED_M_S = 0.5
+HALF_WIDTH_M, HALF_HEIGHT_M = 6.0, 4.0
+
+
+def scan_of_room(x_m):
+    """Ranges of a room 12 m x 8 m from a point on its long axis, looking along it."""
+    angles = np.linspace(-math.pi, math.pi, 360, endpoint=False)
+    with np.errstate(divide="ignore"):
+        to_ends = np.where(np.cos(angles) > 0, HALF_WIDTH_M - x_m, HALF_WIDTH_M + x_m) / np.abs(
+            np.cos(angles)
+        )
+        to_sides = HALF_HEIGHT_M / np.abs(np.sin(angles))
+    return angles, np.minimum(to_ends, to_sides)
+
+
+class Vehicle:
+    """Sends what the sensors of a vehicle say that drives along the room, and hears the mapper."""
+
+    def __init__(self, context, vehicle_id="auv_1"):
+        self.id = vehicle_id
+        self.node = node = rclpy.create_node("vehicle", context=context, namespace=vehicle_id)
+        self.scan_pub = node.create_publisher(LaserScan, "scan", 100)
+        self.imu_pub = node.create_publisher(Imu, "imu", 100)
+        self.twist_pub = node.create_publisher(TwistWithCovarianceStamped, "dvl", 100)
+        self.static_pub = node.create_publisher(TFMessage, "/tf_static", STATIC_TF)
+        self.submaps, self.maps, self.odometry, self.paths = [], [], [], []
+        self.frames, self.diagnostics = {}, []
+        node.create_subscription(SubmapMsg, "submap", self.submaps.append, SUBMAPS)
+        node.create_subscription(OccupancyGrid, "map", self.maps.append, LATCHED)
+        node.create_subscription(Path, "path", self.paths.append, LATCHED)
+        node.create_subscription(Odometry, "odom", self.odometry.append, 100)
+        node.create_subscription(TFMessage, "/tf", self._on_tf, 100)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
+        self.finish_client = node.create_client(Trigger, "sonar_mapper/finish")
+
+    def _on_tf(self, msg):
+        for transform in msg.transforms:
+            self.frames[transform.header.frame_id, transform.child_frame_id] = transform
+
+    def is_connected(self):
+        publishers = (self.scan_pub, self.imu_pub, self.twist_pub, self.static_pub)
+        return all(publisher.get_subscription_count() for publisher in publishers)
+
+    def send_mount(self, x_m=0.0):
+        mount = TransformStamped(child_frame_id=f"{self.id}/sonar")
+        mount.header.frame_id = f"{self.id}/base_link"
+        mount.transform.translation.x = x_m
+        self.static_pub.publish(TFMessage(transforms=[mount]))
+
+    def scan_msg(self, stamp_ns, x_m):
+        angles, ranges = scan_of_room(x_m)
+        msg = LaserScan(
+            angle_min=float(angles[0]),
+            angle_increment=float(angles[1] - angles[0]),
+            range_max=20.0,
+            ranges=[float(value) for value in ranges],
+        )
+        msg.header.frame_id = f"{self.id}/sonar"
+        msg.header.stamp = stamp_to_msg(stamp_ns)
+        return msg
+
+    def send_second(self, second):
+        """Messages of one second: ten of navigation, two scans."""
+        for tenth in range(10):
+            stamp_ns = START_NS + second * 1_000_000_000 + tenth * 100_000_000
+            imu = Imu()
+            imu.header.stamp = stamp_to_msg(stamp_ns)
+            imu.orientation_covariance[8] = 1e-4
+            self.imu_pub.publish(imu)
+            twist = TwistWithCovarianceStamped()
+            twist.header.stamp = stamp_to_msg(stamp_ns)
+            twist.twist.twist.linear.x = SPEED_M_S
+            twist.twist.covariance[0] = twist.twist.covariance[7] = 1e-4
+            self.twist_pub.publish(twist)
+            if tenth % 5 == 0:
+                x_m = SPEED_M_S * (stamp_ns - START_NS) * 1e-9 - 3.0
+                self.scan_pub.publish(self.scan_msg(stamp_ns, x_m))
+
+    def values(self):
+        statuses = [s for msg in self.diagnostics[-1:] for s in msg.status]
+        return {value.key: value.value for status in statuses for value in status.values}
+
+    def message(self):
+        statuses = [status for msg in self.diagnostics[-1:] for status in msg.status]
+        return statuses[-1].message if statuses else ""
+
+
+def mapper_of(context, namespace="auv_1", **settings):
+    settings = {
+        "input": "scan",
+        "velocity": "twist",
+        "reorder_s": 10.0,
+        "is_reliable": True,
+        "mapper.occupancy.resolution_m": 0.1,
+        **settings,
+    }
+    parameters = [Parameter(name, value=value) for name, value in settings.items()]
+    return SonarMapper(context=context, namespace=namespace, parameter_overrides=parameters)
+
+
+def finish(until, vehicle):
+    until(vehicle.finish_client.service_is_ready, "the service")
+    future = vehicle.finish_client.call_async(Trigger.Request())
+    until(future.done, "the end of the mapping")
+    return future.result()
+
+
+def drive(until, vehicle, seconds):
+    """Send, but no faster than the queues are emptied."""
+    for second in seconds:
+        count = int(vehicle.values().get("num_scan", "0"))
+        vehicle.send_second(second)
+        until(lambda c=count: int(vehicle.values().get("num_scan", "0")) >= c, "scans")
+
+
+def test_room_becomes_map_submap_odometry_and_frames(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        drive(until, vehicle, range(10))
+        until(lambda: vehicle.values().get("num_scan") == "20", "all scans")
+        until(lambda: vehicle.values().get("num_imu") == "100", "all of the IMU")
+        response = finish(until, vehicle)
+        assert response.success
+        assert "20 pings mapped into 1 submaps; 0 bad" in response.message
+        until(lambda: vehicle.submaps and vehicle.maps and vehicle.paths, "results")
+        until(lambda: ("auv_1/odom", "auv_1/base_link") in vehicle.frames, "TF")
+        last_ns = START_NS + 9_900_000_000
+        until(lambda: stamp_of(vehicle.odometry[-1]) == last_ns, "the last odometry")
+    submap = submap_from_msg(vehicle.submaps[-1])
+    assert submap.submap_id == ("auv_1", 0)
+    assert submap.is_final
+    assert vehicle.submaps[-1].header.frame_id == "auv_1/submap_0"
+    assert vehicle.maps[-1].header.frame_id == "auv_1/map"
+    assert ("auv_1/map", "auv_1/odom") in vehicle.frames
+    newest = vehicle.odometry[-1]
+    assert (newest.header.frame_id, newest.child_frame_id) == ("auv_1/odom", "auv_1/base_link")
+    # The mean of many matches: within a cell of the way that was driven.
+    assert newest.pose.pose.position.x == pytest.approx(9.9 * SPEED_M_S, abs=0.1)
+    assert newest.pose.pose.position.y == pytest.approx(0.0, abs=0.1)
+    assert newest.twist.twist.linear.x == pytest.approx(SPEED_M_S, abs=0.05)
+    # The left wall is 4 m to the left of the start, the far one 9 m ahead: asymmetric on purpose.
+    occupancy = occupancy_from_msg(vehicle.maps[-1])
+    walls = occupancy.spec.centers_of(np.argwhere(occupancy.values > 65))
+    assert walls[:, 0].max() == pytest.approx(9.0, abs=0.3)
+    assert walls[:, 1].max() == pytest.approx(4.0, abs=0.3)
+    assert len(vehicle.paths[-1].poses) == 20
+
+
+def test_mounts_may_come_after_the_first_messages(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_second(0)
+        until(lambda: vehicle.values().get("num_scan") == "2", "the scans")
+        vehicle.send_mount()
+        response = finish(until, vehicle)
+        assert "2 pings mapped" in response.message
+
+
+def test_bad_messages_are_told_and_survived(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        bad = vehicle.scan_msg(START_NS, 0.0)
+        bad.angle_increment = float("nan")
+        vehicle.scan_pub.publish(bad)
+        until(lambda: vehicle.values().get("num_bad") == "1", "the count")
+        assert "bad message on scan: angle_min" in vehicle.message()
+        unstamped = vehicle.scan_msg(0, 0.0)
+        vehicle.scan_pub.publish(unstamped)
+        until(lambda: "header.stamp is 0.0 s" in vehicle.message(), "the complaint")
+        drive(until, vehicle, range(2))
+        until(lambda: vehicle.values().get("num_scan") == "6", "all scans")
+        assert "4 pings mapped" in finish(until, vehicle).message
+
+
+def test_unknown_frame_is_named(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        for second in range(3):
+            vehicle.send_second(second)
+        until(lambda: vehicle.values().get("num_scan") == "6", "the scans")
+        assert "0 pings mapped" in finish(until, vehicle).message
+        until(lambda: "where auv_1/sonar is on auv_1/base_link" in vehicle.message(), "the name")
+
+
+def test_recording_that_begins_again_begins_a_new_map(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        drive(until, vehicle, range(4))
+        until(lambda: vehicle.values().get("num_scan") == "8", "the first round")
+        drive(until, vehicle, range(2))
+        until(lambda: vehicle.values().get("num_scan") == "12", "the second round")
+        until(lambda: int(vehicle.values().get("num_restarts", "0")) >= 1, "the restart")
+        response = finish(until, vehicle)
+    assert response.success
+    assert vehicle.odometry[-1].pose.pose.position.x < 3 * SPEED_M_S
+
+
+def test_wrong_type_on_a_topic_is_told(ros_context, ros_domain_id, spinning):
+    mapper = mapper_of(ros_context, velocity="dvl")
+    # A process of its own would be a context of its own: one context has one type for a topic.
+    other = rclpy.Context()
+    rclpy.init(context=other, domain_id=ros_domain_id)
+    driver = rclpy.create_node("driver", context=other)
+    driver.create_publisher(TwistWithCovarianceStamped, "/auv_1/dvl", 10)
+    probe, heard = rclpy.create_node("probe", context=ros_context), []
+    probe.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    words = (
+        "topic /auv_1/dvl has type geometry_msgs/msg/TwistWithCovarianceStamped, expected"
+    )
+    with spinning(mapper, probe) as until:
+        until(lambda: heard and words in heard[-1].status[0].message, "the complaint")
+    driver.destroy_node()
+    other.try_shutdown()
+
+
+def test_best_effort_driver_is_heard(ros_context, spinning):
+    mapper = mapper_of(ros_context, is_reliable=False)
+    vehicle = Vehicle(ros_context)
+    publisher = vehicle.node.create_publisher(LaserScan, "scan", qos_profile_sensor_data)
+    with spinning(mapper, vehicle.node) as until:
+        until(publisher.get_subscription_count, "connection")
+        publisher.publish(vehicle.scan_msg(START_NS, 0.0))
+        until(lambda: vehicle.values().get("num_scan") == "1", "the scan")
+
+
+@pytest.mark.parametrize(
+    ("namespace", "settings", "words"),
+    [
+        ("", {}, "vehicle_id is empty and the node has no namespace"),
+        ("auv_1", {"input": "lidar"}, "input is 'lidar', expected one of image, scan, points"),
+        ("auv_1", {"mapper.submap.max_length": 3.0}, "did you mean mapper.submap.max_length_m"),
+    ],
+)
+def test_bad_setting_is_refused(ros_context, namespace, settings, words):
+    with pytest.raises(ConfigError, match=words):
+        mapper_of(ros_context, namespace or None, **settings)
