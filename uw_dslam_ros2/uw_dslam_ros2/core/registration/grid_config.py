@@ -18,17 +18,15 @@ class GridRegistrationConfig(Config):
         doc="signed: walls and free space, both ways; paper: mixture of points, one way",
         choices=("signed", "paper"),
     )
-    features: str = setting(
-        "walls", doc="points of method paper", choices=("orb", "walls", "both")
-    )
+    features: str = setting("orb", doc="points of method paper", choices=("orb", "walls", "both"))
     sigma_cells: float = setting(1.0, 0.5, 5.0, "walls' kernel, in working cells")
     free_penalty: float = setting(0.7, 0.0, 2.0, "worth of a wall on free space, walls being 1")
-    max_points: int = setting(300, 20, 5000, "wall points of each map in the search")
-    working_cells: int = setting(90, 20, 400, "longer side of the larger map in the search")
+    max_points: int = setting(200, 20, 5000, "wall points of each map in the search")
+    working_cells: int = setting(65, 20, 400, "longer side of the larger map in the search")
     finest_cells: int = setting(1000, 100, 4000, "longer side of a map in the refinement")
     max_side_cells: int = setting(8000, 100, 100000, "maps with a longer side are refused")
-    gap: float = setting(0.05, 0.001, 0.5, "relative gap of the certificate")
-    max_boxes: int = setting(400_000, 1000, 1_000_000_000, "search boxes before giving up")
+    gap: float = setting(0.1, 0.001, 0.5, "relative gap of the certificate")
+    max_boxes: int = setting(300_000, 1000, 1_000_000_000, "search boxes before giving up")
     max_seconds: float = setting(20.0, 0.1, 3600.0, "time before giving up [s]; needs a clock")
     min_wall_cells: int = setting(25, 1, 100000, "fewer wall cells in a map are too few")
     min_overlap: float = setting(0.1, 0.0, 1.0, "least common seen area, share of the smaller")

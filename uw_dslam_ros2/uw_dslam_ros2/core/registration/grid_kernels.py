@@ -20,15 +20,19 @@ __all__ = ["bound_boxes", "objective", "objective_at"]
 FloatGrid = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+TableArray = NDArray[np.int16]
+
+TABLE_STEP = 1.0 / 16000.0
+"""Tables hold bounds rounded up to whole multiples of this."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _value_gradient(coefficients: FloatGrid, x: float, y: float) -> tuple[float, float, float]:
     """Field and its gradient [1 / cell] at (x, y), padded coordinates; 0 outside."""
     num_rows, num_cols = coefficients.shape
-    col, row = math.floor(x + 0.5), math.floor(y + 0.5)
-    if row < 1 or col < 1 or row >= num_rows - 1 or col >= num_cols - 1:
+    if x < 0.5 or y < 0.5 or x >= num_cols - 1.5 or y >= num_rows - 1.5:
         return 0.0, 0.0, 0.0
+    col, row = int(x + 0.5), int(y + 0.5)
     dx, dy = x - col, y - row
     wx0, wx1, wx2 = 0.5 * (0.5 - dx) ** 2, 0.75 - dx * dx, 0.5 * (0.5 + dx) ** 2
     gx0, gx1, gx2 = dx - 0.5, -2.0 * dx, dx + 0.5
@@ -101,27 +105,25 @@ def objective_at(
     return values
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _region_max(
-    tables: NDArray[np.float32], layer_of_width: IntArray, width_of_layer: IntArray,
-    x: float, y: float, half_x: float, half_y: float,
-) -> float:  # fmt: skip
-    """Bound of a table's quantity over (x +- half_x, y +- half_y), padded coordinates."""
-    col, row = math.floor(x - half_x + 0.5), math.floor(y - half_y + 0.5)
-    last_col, last_row = math.floor(x + half_x + 0.5), math.floor(y + half_y + 0.5)
+    tables: TableArray, layer_of_width: IntArray, width_of_layer: IntArray,
+    low_x: float, high_x: float, low_y: float, high_y: float,
+) -> int:  # fmt: skip
+    """Bound of a table's quantity over a region; positions count cells, cell 0 starting at 0."""
     num_rows, num_cols = tables.shape[1], tables.shape[2]
-    if last_row < 0 or last_col < 0 or row >= num_rows or col >= num_cols:
-        return 0.0
-    # The rim is as wide as the widest window, so that a window moved to the edge still covers the
-    # same values.
-    row, col = max(row, 0), max(col, 0)
+    if high_x < 0.0 or high_y < 0.0 or low_x >= num_cols or low_y >= num_rows:
+        return 0
+    # The rim is as wide as the widest window, so that a window moved to the edge still covers
+    # the same values. Truncation is the floor of what is not negative, and several times quicker.
+    col, row = int(max(low_x, 0.0)), int(max(low_y, 0.0))
+    last_col, last_row = int(high_x), int(high_y)
     width = max(last_row - row, last_col - col) + 1
-    widest = layer_of_width.shape[0] - 1
-    if width <= widest:
+    if width < layer_of_width.shape[0]:
         return tables[layer_of_width[width], row, col]
     layer = tables.shape[0] - 1
     step = width_of_layer[layer]
-    best = -math.inf
+    best = -32768
     for window_row in range(row, min(last_row + 1, num_rows), step):
         for window_col in range(col, min(last_col + 1, num_cols), step):
             best = max(best, tables[layer, window_row, window_col])
@@ -131,41 +133,49 @@ def _region_max(
 @njit(cache=True, nogil=True)
 def _table_bound(
     theta: float, t_x: float, t_y: float, half_rad: float, half: float, threshold: float,
-    source: FloatArray, source_weight: FloatArray, target_tables: NDArray[np.float32],
-    target: FloatArray, target_weight: FloatArray, source_tables: NDArray[np.float32],
-    center: FloatArray, pad: float, layer_of_width: IntArray, width_of_layer: IntArray,
+    source: FloatArray, source_weight: FloatArray, target_tables: TableArray,
+    target: FloatArray, target_weight: FloatArray, source_tables: TableArray,
+    center: FloatArray, pad: float, scale: float,
+    layer_of_width: IntArray, width_of_layer: IntArray,
 ) -> float:  # fmt: skip
     """Sum of each point's greatest field value over the region that it can reach from the box.
 
-    Gives up early, with a bound that is still true, once the rest cannot lift it over
-    ``threshold``.
+    ``scale`` is the number of table cells per working cell. Gives up early, with a bound that is
+    still true, once the rest cannot lift it over ``threshold``.
     """
     cos, sin = math.cos(theta), math.sin(theta)
     arc, sag = math.sin(min(half_rad, 0.5 * math.pi)), 1.0 - math.cos(half_rad)
     turned_half = half * min(math.sqrt(2.0), abs(cos) + abs(sin) + math.sqrt(2.0) * half_rad)
+    # Table cells tile the plane from half a working cell before the first centre on.
+    shift = pad + 0.5
     total, rest = 0.0, 0.0
     for i in range(source.shape[0]):
         rest += source_weight[i]
     for j in range(target.shape[0]):
         rest += target_weight[j]
-    num = max(source.shape[0], target.shape[0])
-    for k in range(num):
+    for k in range(max(source.shape[0], target.shape[0])):
         if k < source.shape[0]:
             px = cos * source[k, 0] - sin * source[k, 1]
             py = sin * source[k, 0] + cos * source[k, 1]
-            total += source_weight[k] * _region_max(
-                target_tables, layer_of_width, width_of_layer, px + t_x + pad, py + t_y + pad,
-                half + abs(py) * arc + abs(px) * sag, half + abs(px) * arc + abs(py) * sag,
+            half_x = half + abs(py) * arc + abs(px) * sag
+            half_y = half + abs(px) * arc + abs(py) * sag
+            x, y = px + t_x + shift, py + t_y + shift
+            total += source_weight[k] * TABLE_STEP * _region_max(
+                target_tables, layer_of_width, width_of_layer,
+                scale * (x - half_x), scale * (x + half_x),
+                scale * (y - half_y), scale * (y + half_y),
             )  # fmt: skip
             rest -= source_weight[k]
         if k < target.shape[0]:
             ux, uy = target[k, 0] - t_x, target[k, 1] - t_y
             qx, qy = cos * ux + sin * uy, cos * uy - sin * ux
-            total += target_weight[k] * _region_max(
+            half_x = turned_half + abs(qy) * arc + abs(qx) * sag
+            half_y = turned_half + abs(qx) * arc + abs(qy) * sag
+            x, y = qx + center[0] + shift, qy + center[1] + shift
+            total += target_weight[k] * TABLE_STEP * _region_max(
                 source_tables, layer_of_width, width_of_layer,
-                qx + center[0] + pad, qy + center[1] + pad,
-                turned_half + abs(qy) * arc + abs(qx) * sag,
-                turned_half + abs(qx) * arc + abs(qy) * sag,
+                scale * (x - half_x), scale * (x + half_x),
+                scale * (y - half_y), scale * (y + half_y),
             )  # fmt: skip
             rest -= target_weight[k]
         if (k & 15) == 15 and total + rest <= threshold:
@@ -177,9 +187,9 @@ def _table_bound(
 def _smooth_bound(
     theta: float, t_x: float, t_y: float, half_rad: float, half: float,
     source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
-    target_curvature: NDArray[np.float32],
+    target_curvature: TableArray,
     target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
-    source_curvature: NDArray[np.float32],
+    source_curvature: TableArray,
     center: FloatArray, pad: float, layer_of_width: IntArray, width_of_layer: IntArray,
 ) -> tuple[float, float]:  # fmt: skip
     """Value at the box's centre, and a second-order bound over the box.
@@ -198,9 +208,10 @@ def _smooth_bound(
         radius = math.sqrt(px * px + py * py)
         reach = reach_t + radius * half_rad
         x, y = px + t_x + pad, py + t_y + pad
-        curvature = _region_max(
-            target_curvature, layer_of_width, width_of_layer, x, y, reach, reach
-        )
+        curvature = TABLE_STEP * _region_max(
+            target_curvature, layer_of_width, width_of_layer,
+            x + 0.5 - reach, x + 0.5 + reach, y + 0.5 - reach, y + 0.5 + reach,
+        )  # fmt: skip
         value, gx, gy = _value_gradient(target_field, x, y)
         weight = source_weight[i]
         total += weight * value
@@ -215,9 +226,10 @@ def _smooth_bound(
         radius = math.sqrt(qx * qx + qy * qy)
         reach = reach_t + radius * half_rad
         x, y = qx + center[0] + pad, qy + center[1] + pad
-        curvature = _region_max(
-            source_curvature, layer_of_width, width_of_layer, x, y, reach, reach
-        )
+        curvature = TABLE_STEP * _region_max(
+            source_curvature, layer_of_width, width_of_layer,
+            x + 0.5 - reach, x + 0.5 + reach, y + 0.5 - reach, y + 0.5 + reach,
+        )  # fmt: skip
         value, gx, gy = _value_gradient(source_field, x, y)
         weight = target_weight[j]
         total += weight * value
@@ -235,10 +247,11 @@ def bound_boxes(
     boxes: FloatArray, parent_bound: FloatArray, half_rad: float, half: float, threshold: float,
     is_smooth: bool,
     source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
-    target_tables: NDArray[np.float32], target_curvature: NDArray[np.float32],
+    target_tables: TableArray, target_curvature: TableArray,
     target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
-    source_tables: NDArray[np.float32], source_curvature: NDArray[np.float32],
-    center: FloatArray, pad: float, layer_of_width: IntArray, width_of_layer: IntArray,
+    source_tables: TableArray, source_curvature: TableArray,
+    center: FloatArray, pad: float, scale: float,
+    layer_of_width: IntArray, width_of_layer: IntArray,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Upper bounds (K,) over boxes (K, 3) [theta, t_x, t_y] of one size, and values (K,) inside.
 
@@ -251,7 +264,8 @@ def bound_boxes(
         theta, t_x, t_y = boxes[k, 0], boxes[k, 1], boxes[k, 2]
         bound = _table_bound(
             theta, t_x, t_y, half_rad, half, threshold, source, source_weight, target_tables,
-            target, target_weight, source_tables, center, pad, layer_of_width, width_of_layer,
+            target, target_weight, source_tables, center, pad, scale,
+            layer_of_width, width_of_layer,
         )  # fmt: skip
         bound = min(bound, parent_bound[k])
         if is_smooth and bound > threshold:

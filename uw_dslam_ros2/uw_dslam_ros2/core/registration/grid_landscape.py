@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from uw_dslam_ros2.core.registration.grid_problem import GridProblem
+from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.signed_field import PAD
 
 __all__ = ["Landscape", "scan_landscape"]
@@ -28,8 +28,10 @@ class Landscape:
     scores: FloatArray
 
 
-def scan_landscape(problem: GridProblem, num_peaks: int) -> Landscape:
-    """Best poses of the whole plane of motions, one cell apart in translation and at the rim.
+def scan_landscape(
+    problem: GridProblem, num_peaks: int, window: PoseWindow | None = None
+) -> Landscape:
+    """Best poses of a window, or of the whole plane of motions, about a cell apart.
 
     Both directions are correlations for a fixed rotation: the turned source points with the
     target's field, and the target's points with the turned source field; they share one inverse
@@ -38,14 +40,30 @@ def scan_landscape(problem: GridProblem, num_peaks: int) -> Landscape:
     scan = _Scan(problem)
     num_rotations = max(16, math.ceil(2.0 * math.pi * problem.radius * 1.2 / 1.3))
     poses, scores = [], []
-    for theta in np.arange(num_rotations) * (2.0 * math.pi / num_rotations) - math.pi:
-        for row, col, score in _peaks(scan.scores(float(theta))):
-            poses.append((theta, *scan.shift_of(row, col)))
-            scores.append(score)
+    for theta in _rotations(num_rotations, window):
+        scores_here = scan.scores(theta)
+        if window is not None:
+            scores_here = scan.masked(scores_here, window)
+        for row, col, score in _peaks(scores_here):
+            if score > -math.inf:
+                poses.append((theta, *scan.shift_of(row, col)))
+                scores.append(score)
+    if not poses:
+        return Landscape(np.empty((0, 3)), np.empty(0))
     order = np.argsort(scores)[::-1]
     all_poses, all_scores = np.array(poses)[order], np.array(scores)[order]
     keep = distinct(all_poses, problem.radius, 3.0, num_peaks)
     return Landscape(all_poses[keep], all_scores[keep])
+
+
+def _rotations(num_rotations: int, window: PoseWindow | None) -> list[float]:
+    """Evenly spaced rotations of a window, its middle among them."""
+    step = 2.0 * math.pi / num_rotations
+    if window is None or window.half[0] > math.pi - step:
+        return [float(k * step - math.pi) for k in range(num_rotations)]
+    num_beside = math.ceil(float(window.half[0]) / step)
+    steps = np.arange(-num_beside, num_beside + 1) / num_beside
+    return [float(theta) for theta in window.middle[0] + window.half[0] * steps]
 
 
 def distinct(poses: FloatArray, radius: float, separation_cells: float, limit: int) -> list[int]:
@@ -94,6 +112,17 @@ class _Scan:
         is_low_row = row > last[0] - 2 * PAD + self._half
         is_low_col = col > last[1] - 2 * PAD + self._half
         return col - num_cols * is_low_col, row - num_rows * is_low_row
+
+    def masked(self, scores: NDArray[np.float32], window: PoseWindow) -> NDArray[np.float32]:
+        """Scores with -inf outside of a window of translations."""
+        shifts = [self.shift_of(k, k) for k in range(max(self._shape))]
+        col_shift = np.array([s[0] for s in shifts[: self._shape[1]]])
+        row_shift = np.array([s[1] for s in shifts[: self._shape[0]]])
+        low = window.middle[1:] - window.half[1:] - 1.0
+        high = window.middle[1:] + window.half[1:] + 1.0
+        is_col = (col_shift >= low[0]) & (col_shift <= high[0])
+        is_row = (row_shift >= low[1]) & (row_shift <= high[1])
+        return np.where(is_row[:, None] & is_col, scores, np.float32(-np.inf))
 
     def scores(self, theta: float) -> NDArray[np.float32]:
         """Objective where the source's centre lies; `shift_of` tells where that is."""

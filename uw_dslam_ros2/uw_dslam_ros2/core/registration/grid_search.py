@@ -12,30 +12,31 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration import grid_kernels
-from uw_dslam_ros2.core.registration.grid_problem import GridProblem
-from uw_dslam_ros2.core.registration.signed_field import PAD, bound_tables, layer_lookup
+from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.signed_field import (
+    PAD,
+    curvature_tables,
+    layer_lookup,
+    refined,
+    value_tables,
+)
 
-__all__ = ["PoseWindow", "SearchLimits", "SearchOutcome", "search_poses"]
+__all__ = ["SearchLimits", "SearchOutcome", "search_poses", "whole_plane"]
 
 FloatArray = NDArray[np.float64]
+TableArray = NDArray[np.int16]
 _ROOT_HALF_CELLS = 8.0
+_FINE_FROM_HALF_CELLS = 2.0
 _SMOOTH_FROM_HALF_CELLS = 0.5
 _SMALLEST_HALF_CELLS = 0.01
 _CHUNK = 2048
 _OCTANTS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseWindow:
-    """Box of poses: middle and half-widths, each (3,) [theta, t_x, t_y] in [rad, cells, cells]."""
-
-    middle: FloatArray
-    half: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +56,7 @@ class SearchOutcome:
     lower_bound: float
     upper_bound: float
     is_complete: bool
+    is_stopped: bool  # by the question, not by the number of boxes
     num_boxes: int
 
 
@@ -108,20 +110,29 @@ class _Search:
         self._problem = problem
         self._limits = limits
         self._report = report
-        target_tables, target_curvature = bound_tables(problem.target_field)
-        source_tables, source_curvature = bound_tables(problem.source_field)
-        layer_of_width, width_of_layer = layer_lookup()
-        self._arguments = (
-            problem.source_points, problem.source_weights, problem.target_field.coefficients,
-            target_tables, target_curvature,
-            problem.target_points, problem.target_weights, problem.source_field.coefficients,
-            source_tables, source_curvature,
-            problem.center, float(PAD), layer_of_width, width_of_layer,
-        )  # fmt: skip
+        fields = (problem.target_field, problem.source_field)
+        coarse = [value_tables(field) for field in fields]
+        fine = [value_tables(refined(field)) for field in fields]
+        curvature = [curvature_tables(field) for field in fields]
+        self._coarse = self._kernel_arguments(coarse, curvature, 1.0)
+        self._fine = self._kernel_arguments(fine, curvature, 2.0)
         self._pose = start
         self._best = problem.value(start)
         self._dropped = -math.inf  # greatest bound of a dropped box
         self._num_boxes = 0
+        self._is_stopped = False
+
+    def _kernel_arguments(
+        self, values: list[TableArray], curvature: list[TableArray], scale: float
+    ) -> tuple[Any, ...]:
+        problem = self._problem
+        return (
+            problem.source_points, problem.source_weights, problem.target_field.coefficients,
+            values[0], curvature[0],
+            problem.target_points, problem.target_weights, problem.source_field.coefficients,
+            values[1], curvature[1],
+            problem.center, float(PAD), scale, *layer_lookup(),
+        )  # fmt: skip
 
     @property
     def _threshold(self) -> float:
@@ -161,7 +172,7 @@ class _Search:
                 return None
             bounds, values = grid_kernels.bound_boxes(
                 boxes[chunk], parents[chunk], half_rad, half, self._threshold, is_smooth,
-                *self._arguments,
+                *(self._fine if half <= _FINE_FROM_HALF_CELLS else self._coarse),
             )  # fmt: skip
             self._num_boxes += len(bounds)
             self._improve(boxes[chunk], values)
@@ -182,9 +193,8 @@ class _Search:
 
     def _is_out_of_budget(self) -> bool:
         should_stop = self._limits.should_stop
-        return self._num_boxes >= self._limits.max_boxes or (
-            should_stop is not None and should_stop()
-        )
+        self._is_stopped = should_stop is not None and should_stop()
+        return self._is_stopped or self._num_boxes >= self._limits.max_boxes
 
     def _tell(self, parents: FloatArray, kept: list[FloatArray], num_open: int) -> None:
         if self._report is None:
@@ -195,7 +205,9 @@ class _Search:
 
     def _outcome(self, is_complete: bool) -> SearchOutcome:
         upper = min(max(self._best, self._dropped), 1.0)
-        return SearchOutcome(self._pose, self._best, upper, is_complete, self._num_boxes)
+        return SearchOutcome(
+            self._pose, self._best, upper, is_complete, self._is_stopped, self._num_boxes
+        )
 
 
 def _roots(window: PoseWindow, radius: float) -> tuple[FloatArray, float, float]:

@@ -14,15 +14,15 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence, clean_cells, coarsen
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grid_landscape import Landscape, distinct, scan_landscape
-from uw_dslam_ros2.core.registration.grid_problem import GridProblem, build_problem
+from uw_dslam_ros2.core.registration.grid_landscape import distinct, scan_landscape
+from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow, build_problem
 from uw_dslam_ros2.core.registration.grid_search import (
-    PoseWindow,
     SearchLimits,
     SearchOutcome,
     search_poses,
     whole_plane,
 )
+from uw_dslam_ros2.core.registration.paper_grids import register_grids_by_points
 from uw_dslam_ros2.core.registration.refine_grids import (
     Agreement,
     WallMap,
@@ -40,7 +40,7 @@ from uw_dslam_ros2.core.registration.result import (
 from uw_dslam_ros2.core.registration.verdict import MatchEvidence, decide
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["GridRegistrationConfig", "register_grids"]
+__all__ = ["GridRegistrationConfig", "match_evidence", "register_grids"]
 
 FloatArray = NDArray[np.float64]
 Clock = Callable[[], float]
@@ -50,6 +50,8 @@ _NUM_REFINED = 8
 _FINE_POINTS = 1200
 _FINE_SIGMA_CELLS = 2.0
 _LEAST_SIDE_CELLS = 4
+_NUM_BOXES_OF_REFUSED = 20_000
+_RIVAL_SHARE = 0.5
 
 
 def register_grids(
@@ -89,14 +91,40 @@ def register_grids(
     InvalidInputError
         Where a prior's widths are not positive.
     """
-    match = _GridMatch(source, target, config or GridRegistrationConfig(), prior, clock)
+    config = config or GridRegistrationConfig()
+    if config.method == "paper":
+        return register_grids_by_points(
+            source, target, config,
+            prior=prior, clock=clock, progress=progress, is_cancelled=is_cancelled,
+        )  # fmt: skip
+    match = _GridMatch(source, target, config, prior, clock)
     return match.run(progress, is_cancelled)
+
+
+def match_evidence(
+    source: OccupancyMap, target: OccupancyMap, config: GridRegistrationConfig | None = None
+) -> tuple[MatchEvidence, SE2] | None:
+    """What `register_grids` would judge by, and its best pose, without the proof; for studies.
+
+    None where a map holds too little to be matched.
+    """
+    match = _GridMatch(source, target, config or GridRegistrationConfig(), None, None)
+    return match.collect()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
     pose: FloatArray
     score: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    # What the evidence refuses anyway gets a short search, which may find better.
+
+    refined: list[_Candidate]
+    shares: tuple[float, ...]
+    evidence: MatchEvidence
 
 
 class _GridMatch:
@@ -142,15 +170,44 @@ class _GridMatch:
             sides.append(coarsen(cells, resolution_m))
         levels = self._levels(sides[0], sides[1])
         window = self._window(levels[0])
-        landscape = scan_landscape(levels[0], _NUM_CANDIDATES)
-        candidates = _climb(levels[0], landscape.poses)
-        candidates = [c for c in candidates if _is_inside(window, c.pose)] or [
-            _Candidate(window.middle, levels[0].value(window.middle))
-        ]
-        outcome = self._certify(levels[0], window, candidates[0].pose, progress, is_cancelled)
-        candidates = _merge_best(levels[0], candidates, outcome)
-        refined = self._refine(levels, candidates)
-        return self._judge(sides, levels, landscape, outcome, refined)
+        candidates, surprise = self._scan(levels[0], window)
+        found = self._weigh(sides, levels, self._refine(levels, candidates), surprise)
+        verdict, _, _ = decide(found.evidence, self._config)
+        # A match that the evidence refuses anyway gets a short search, in case it finds a better
+        # one.
+        num_boxes = self._config.max_boxes
+        if verdict is not Verdict.ACCEPTED:
+            num_boxes = min(num_boxes, _NUM_BOXES_OF_REFUSED)
+        outcome = self._certify(
+            levels[0], window, candidates[0].pose, num_boxes, progress, is_cancelled
+        )
+        if outcome.lower_bound > candidates[0].score * (1.0 + 1e-6):
+            candidates = _merge_best(levels[0], candidates, outcome)
+            found = self._weigh(sides, levels, self._refine(levels, candidates), surprise)
+        return self._answer(levels, outcome, found)
+
+    def collect(self) -> tuple[MatchEvidence, SE2] | None:
+        """Evidence for the best pose, and the pose; None where a map holds too little."""
+        resolution_m = self._finest_resolution()
+        sides = []
+        for name, occupancy in (("source", self._source), ("target", self._target)):
+            cells = clean_cells(occupancy)
+            if _too_little(name, occupancy, cells, self._config) is not None:
+                return None
+            sides.append(coarsen(cells, resolution_m))
+        levels = self._levels(sides[0], sides[1])
+        candidates, surprise = self._scan(levels[0], self._window(levels[0]))
+        found = self._weigh(sides, levels, self._refine(levels, candidates), surprise)
+        return found.evidence, self._to_frame(levels[-1].to_motion(found.refined[0].pose))
+
+    def _scan(self, problem: GridProblem, window: PoseWindow) -> tuple[list[_Candidate], float]:
+        """Candidates of the whole window, best first, and how far the best stands out."""
+        landscape = scan_landscape(problem, _NUM_CANDIDATES, window)
+        candidates = _climb(problem, landscape.poses)
+        candidates = [c for c in candidates if _is_inside(window, c.pose)]
+        if not candidates:
+            candidates = [_Candidate(window.middle, problem.value(window.middle))]
+        return candidates, _surprise(candidates, problem.radius)
 
     def _finest_resolution(self) -> float:
         specs = (self._source.spec, self._target.spec)
@@ -216,6 +273,7 @@ class _GridMatch:
         problem: GridProblem,
         window: PoseWindow,
         start: FloatArray,
+        num_boxes: int,
         progress: Callable[[Progress], None] | None,
         is_cancelled: Callable[[], bool] | None,
     ) -> SearchOutcome:
@@ -232,7 +290,7 @@ class _GridMatch:
                 motion = self._to_frame(problem.to_motion(pose))
                 progress(Progress("search", lower, upper, num_boxes, num_open, motion))
 
-        limits = SearchLimits(self._config.gap, self._config.max_boxes, should_stop)
+        limits = SearchLimits(self._config.gap, num_boxes, should_stop)
         return search_poses(problem, window, start, limits, report)
 
     def _refine(self, levels: list[GridProblem], candidates: list[_Candidate]) -> list[_Candidate]:
@@ -243,47 +301,56 @@ class _GridMatch:
             refined = _climb(fine, np.array(poses))
         return refined
 
-    def _judge(
+    def _weigh(
         self,
         sides: list[CellEvidence],
         levels: list[GridProblem],
-        landscape: Landscape,
-        outcome: SearchOutcome,
         refined: list[_Candidate],
-    ) -> RegistrationResult:
+        surprise: float,
+    ) -> _Found:
+        """Evidence for the best of refined candidates."""
         finest, best = levels[-1], refined[0]
         T_grids = finest.to_motion(best.pose)
-        T_cells = SE2(
-            T_grids.x / finest.resolution_m, T_grids.y / finest.resolution_m, T_grids.yaw
-        )
+        scale = 1.0 / finest.resolution_m
+        T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
         agreement = measure_agreement(WallMap(sides[0]), WallMap(sides[1]), T_cells)
         shares = [c.score / best.score if best.score > 0.0 else 1.0 for c in refined[1:]]
         values = np.linalg.eigvalsh(curvature(finest, best.pose))
         evidence = MatchEvidence(
-            agreement,
-            best.score,
-            _surprise(landscape, levels[0].radius),
-            max(shares, default=0.0),
-            max(float(values[0]), 0.0) / max(float(values[-1]), 1e-12),
-            outcome.is_complete,
+            agreement=agreement,
+            score=best.score,
+            surprise=surprise,
+            rival_share=max(shares, default=0.0),
+            stiffness=max(float(values[0]), 0.0) / max(float(values[-1]), 1e-12),
         )
-        verdict, reason, probability = decide(evidence, self._config)
-        motion = self._to_frame(T_grids)
-        work = levels[0]
-        rivals = tuple(
-            Rival(
-                self._to_frame(finest.to_motion(c.pose)),
-                share,
-                outcome.upper_bound / max(outcome.lower_bound, 1e-12),
+        return _Found(refined, tuple(shares), evidence)
+
+    def _answer(
+        self, levels: list[GridProblem], outcome: SearchOutcome, found: _Found
+    ) -> RegistrationResult:
+        work, finest = levels[0], levels[-1]
+        pose, agreement = found.refined[0].pose, found.evidence.agreement
+        verdict, reason, probability = decide(found.evidence, self._config)
+        if outcome.is_stopped or (verdict is Verdict.ACCEPTED and not outcome.is_complete):
+            verdict = Verdict.BUDGET_EXHAUSTED
+            reason = (
+                f"stopped after {outcome.num_boxes} boxes with a gap of "
+                f"{1.0 - outcome.lower_bound / max(outcome.upper_bound, 1e-12):.0%}, "
+                f"expected {self._config.gap:.0%}"
             )
-            for c, share in zip(refined[1:], shares, strict=True)
-            if share > 0.5
+        motion = self._to_frame(finest.to_motion(pose))
+        bound = outcome.upper_bound / max(outcome.lower_bound, 1e-12)
+        rivals = tuple(
+            Rival(self._to_frame(finest.to_motion(c.pose)), share, bound)
+            for c, share in zip(found.refined[1:], found.shares, strict=True)
+            if share > _RIVAL_SHARE
         )
+        source_points = work.source_points + work.center
         return RegistrationResult(
             verdict=verdict,
             reason=reason,
             T_target_source=motion,
-            covariance=self._covariance(finest, best.pose, agreement, motion),
+            covariance=self._covariance(finest, pose, agreement, motion),
             probability=probability,
             score=outcome.lower_bound,
             lower_bound=outcome.lower_bound,
@@ -297,9 +364,7 @@ class _GridMatch:
             num_source_points=len(work.source_points),
             num_target_points=len(work.target_points),
             rivals=rivals,
-            source_points=self._points(
-                work.source_points + work.center, work.resolution_m, self._source
-            ),
+            source_points=self._points(source_points, work.resolution_m, self._source),
             target_points=self._points(work.target_points, work.resolution_m, self._target),
         )
 
@@ -397,12 +462,19 @@ def _merge_best(
     return [merged[k] for k in distinct(stacked, problem.radius, 1.0, len(merged))]
 
 
-def _surprise(landscape: Landscape, radius: float) -> float:
-    """How far the best peak lies above the peaks elsewhere, in their standard deviations."""
-    poses, scores = landscape.poses, landscape.scores
-    turn = np.abs((poses[:, 0] - poses[0, 0] + math.pi) % (2.0 * math.pi) - math.pi) * radius
-    apart = np.hypot(*(poses[:, 1:] - poses[0, 1:]).T)
-    others = scores[(turn > 4.0) | (apart > 4.0)]
-    if len(others) < 3:
+def _surprise(candidates: list[_Candidate], radius: float) -> float:
+    """How far the best candidate lies above those elsewhere, in their standard deviations.
+
+    The others are the best that chance reaches at other poses of these two maps.
+    """
+    best = candidates[0]
+    others = [
+        c.score
+        for c in candidates[1:]
+        if abs(wrap_angle(float(c.pose[0] - best.pose[0]))) * radius > 4.0
+        or np.hypot(*(c.pose[1:] - best.pose[1:])) > 4.0
+    ]
+    if len(others) < 4:
         return 0.0
-    return float((scores[0] - others.mean()) / max(float(others.std()), 1e-6))
+    spread = max(float(np.std(others)), 0.02 * best.score, 1e-9)
+    return float((best.score - np.mean(others)) / spread)

@@ -9,10 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+from uw_dslam_ros2.core.registration.grid_kernels import TABLE_STEP
 
-__all__ = ["PAD", "SignedField", "bound_tables", "layer_lookup", "signed_field"]
+__all__ = [
+    "PAD",
+    "SignedField",
+    "curvature_tables",
+    "layer_lookup",
+    "refined",
+    "signed_field",
+    "value_tables",
+]
 
 FloatGrid = NDArray[np.float32]
+TableArray = NDArray[np.int16]
 
 WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32)
 """Windows, in cells, over which the tables hold maxima."""
@@ -67,23 +77,47 @@ def layer_lookup() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.searchsorted(widths, np.arange(widths[-1] + 1)).astype(np.int64), widths
 
 
-def bound_tables(field: SignedField) -> tuple[FloatGrid, FloatGrid]:
-    """Upper bounds of field and curvature [1 / cell^2] over windows of `WIDTHS` cells.
+def value_tables(field: SignedField) -> TableArray:
+    """Upper bounds of a field over windows of `WIDTHS` cells, in `TABLE_STEP`.
 
-    Each is (num_widths, R, C); entry [k, row, col] holds for the cells row..row + width - 1 and
-    likewise for columns. Within a cell the spline is a polynomial inside the hull of its nine
-    Bezier coefficients; its second derivatives are inside the hull of the coefficients' second
-    differences.
+    The result is (num_widths, R, C); entry [k, row, col] holds for the cells row..row + width - 1
+    and likewise for columns. Within a cell the spline is a polynomial inside the hull of its nine
+    Bezier coefficients.
+    """
+    return _windows(_bezier_max(field.coefficients))
+
+
+def curvature_tables(field: SignedField) -> TableArray:
+    """Upper bounds of the field's greatest curvature [1 / cell^2], otherwise as `value_tables`.
+
+    Second derivatives are inside the hull of the coefficients' second differences.
+    """
+    return _windows(_curvature_max(field.coefficients))
+
+
+def refined(field: SignedField) -> SignedField:
+    """The same function on a lattice twice as fine, by Chaikin's knot insertion.
+
+    Its cells are the halves of the coarse ones: cells 2 k and 2 k + 1 make up cell k.
     """
     c = field.coefficients
-    value = _bezier_max(c)
-    curvature = _curvature_max(c)
-    tables = np.empty((2, len(WIDTHS), *c.shape), np.float32)
+    for axis in (0, 1):
+        p = np.pad(c, [(1, 1) if k == axis else (0, 0) for k in (0, 1)])
+        before = p[:-2] if axis == 0 else p[:, :-2]
+        after = p[2:] if axis == 0 else p[:, 2:]
+        near, far = np.float32(0.75), np.float32(0.25)
+        pair = np.stack([near * c + far * before, near * c + far * after], axis=axis + 1)
+        c = pair.reshape(c.shape[0] * (2 - axis), c.shape[1] * (1 + axis))
+    return SignedField(c)
+
+
+def _windows(base: FloatGrid) -> TableArray:
+    # The margin covers that kernels compute in double precision from single-precision numbers.
+    steps = np.ceil((base + np.float32(2e-6)) / np.float32(TABLE_STEP)).astype(np.int16)
+    tables = np.empty((len(WIDTHS), *base.shape), np.int16)
     for layer, width in enumerate(WIDTHS):
-        window = np.ones((width, width), np.uint8)
-        for kind, base in enumerate((value, curvature)):
-            tables[kind, layer] = cv2.dilate(base, window, anchor=(0, 0))
-    return tables[0], tables[1]
+        tables[layer] = cv2.dilate(steps, np.ones((width, width), np.uint8), anchor=(0, 0))
+    return tables
 
 
 def _bezier_max(c: FloatGrid) -> FloatGrid:
@@ -96,8 +130,7 @@ def _bezier_max(c: FloatGrid) -> FloatGrid:
         np.maximum(best, line[1:-1], out=best)
         np.maximum(best, half * (line[:-2] + line[1:-1]), out=best)
         np.maximum(best, half * (line[1:-1] + line[2:]), out=best)
-    # Kernels compute in double precision from the same single-precision coefficients.
-    return best + np.float32(1e-6)
+    return best
 
 
 def _curvature_max(c: FloatGrid) -> FloatGrid:
@@ -114,4 +147,4 @@ def _curvature_max(c: FloatGrid) -> FloatGrid:
     xy = np.maximum(
         np.maximum(cross[:-1, :-1], cross[:-1, 1:]), np.maximum(cross[1:, :-1], cross[1:, 1:])
     )
-    return np.maximum(np.maximum(xx, yy) + xy, np.float32(0.0)) + np.float32(1e-6)
+    return np.clip(np.maximum(xx, yy) + xy, np.float32(0.0), np.float32(2.0))

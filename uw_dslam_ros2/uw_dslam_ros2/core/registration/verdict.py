@@ -9,7 +9,7 @@ from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.refine_grids import Agreement
 from uw_dslam_ros2.core.registration.result import Verdict
 
-__all__ = ["MatchEvidence", "decide", "probability_of"]
+__all__ = ["FEATURE_NAMES", "MatchEvidence", "decide", "evidence_features", "probability_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,29 +27,31 @@ class MatchEvidence:
     surprise: float
     rival_share: float
     stiffness: float
-    is_certified: bool
 
 
-# Logistic model: intercept, then one coefficient for each of `_features`.
-_COEFFICIENTS = (-9.0, 6.0, -6.0, 0.8, 0.5, -6.0)
+FEATURE_NAMES = ("agreement", "conflict", "log_agreeing", "log_surprise", "rival_share", "overlap")
+
+# Logistic model: intercept, then one coefficient for each of `FEATURE_NAMES`.
+_COEFFICIENTS = (-9.0, 6.0, -6.0, 0.8, 2.0, -6.0, 0.0)
 
 
-def _features(evidence: MatchEvidence) -> tuple[float, ...]:
+def evidence_features(evidence: MatchEvidence) -> tuple[float, ...]:
+    """Quantities of which the probability is made, as `FEATURE_NAMES`."""
     agreement = evidence.agreement
-    num_agreeing = agreement.agreement * agreement.num_walls
     return (
         agreement.agreement,
         agreement.conflict,
-        math.log1p(num_agreeing),
-        min(evidence.surprise, 20.0),
+        math.log1p(agreement.agreement * agreement.num_walls),
+        math.log(min(max(evidence.surprise, 0.5), 30.0)),
         evidence.rival_share,
+        agreement.overlap,
     )
 
 
 def probability_of(evidence: MatchEvidence) -> float:
     """Probability in [0, 1] that the best pose is right, of a model fitted on simulated pairs."""
     logit = _COEFFICIENTS[0] + sum(
-        c * x for c, x in zip(_COEFFICIENTS[1:], _features(evidence), strict=True)
+        c * x for c, x in zip(_COEFFICIENTS[1:], evidence_features(evidence), strict=True)
     )
     return 1.0 / (1.0 + math.exp(-max(min(logit, 50.0), -50.0)))
 
@@ -58,12 +60,6 @@ def decide(evidence: MatchEvidence, config: GridRegistrationConfig) -> tuple[Ver
     """Verdict, its reason with the numbers that decided, and the pose's probability."""
     probability = probability_of(evidence)
     agreement = evidence.agreement
-    if not evidence.is_certified:
-        return (
-            Verdict.BUDGET_EXHAUSTED,
-            "the search stopped before the proof was complete",
-            probability,
-        )
     if agreement.overlap < config.min_overlap:
         return (
             Verdict.NOT_ENOUGH_OVERLAP,

@@ -1,0 +1,74 @@
+"""Pairs of maps for the studies of map registration, and what counts as right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
+
+__all__ = ["PairSpec", "is_right", "pair_errors", "pair_specs"]
+
+RIGHT_CELLS = 6.0
+RIGHT_RAD = math.radians(2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class PairSpec:
+    """How one pair of maps is made."""
+
+    kind: str
+    overlap: float
+    noise: str
+    seed: int
+    is_matching: bool = True
+    is_sonar: bool = False
+
+    def make(self) -> MapPair:
+        """The pair."""
+        return make_pair(
+            self.kind,
+            self.overlap,
+            self.noise,
+            self.seed,
+            is_matching=self.is_matching,
+            is_sonar=self.is_sonar,
+        )
+
+
+def pair_specs(
+    kinds: tuple[str, ...],
+    overlaps: tuple[float, ...],
+    noises: tuple[str, ...],
+    seeds: range,
+    share_of_different: float = 0.5,
+) -> Iterator[PairSpec]:
+    """All combinations, every third as sonar would see it; some again with maps of two places."""
+    for seed in seeds:
+        for kind in kinds:
+            for number, overlap in enumerate(overlaps):
+                for noise in noises:
+                    is_sonar = kind != "office" and (seed + number) % 3 == 0
+                    yield PairSpec(kind, overlap, noise, seed, True, is_sonar)
+                    choice = np.random.default_rng((seed, number, len(kind), len(noise)))
+                    if choice.random() < share_of_different:
+                        yield PairSpec(kind, overlap, noise, seed, False, is_sonar)
+
+
+def pair_errors(pair: MapPair, T_target_source: SE2) -> tuple[float, float]:
+    """Errors at the source map's middle [m] and in rotation [rad]; infinite without truth."""
+    if pair.T_target_source is None:
+        return math.inf, math.inf
+    middle = pair.source.spec.corners().mean(axis=0)
+    offset = T_target_source.apply(middle) - pair.T_target_source.apply(middle)
+    return float(np.hypot(*offset)), T_target_source.distance_to(pair.T_target_source)[1]
+
+
+def is_right(pair: MapPair, T_target_source: SE2) -> bool:
+    """Within 2 degrees and six cells, 0.30 m at 0.05 m."""
+    error_m, error_rad = pair_errors(pair, T_target_source)
+    return error_rad < RIGHT_RAD and error_m < RIGHT_CELLS * pair.source.spec.resolution_m
