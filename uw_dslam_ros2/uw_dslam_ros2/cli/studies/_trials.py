@@ -12,15 +12,26 @@ import numpy as np
 
 from uw_dslam_ros2.cli.studies._common import is_success, progress, summary
 from uw_dslam_ros2.core.registration import RegistrationConfig, register_point_sets
-from uw_dslam_ros2.core.registration.baselines import point_baselines, procrustes
+from uw_dslam_ros2.core.registration.baselines import icp, point_baselines, procrustes
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem, overlap_problem
 
-__all__ = ["ENGINE", "ORACLE", "PAPER", "Cell", "Trial", "method_names", "run_cell", "summarise"]
+__all__ = [
+    "ENGINE",
+    "ORACLE",
+    "PAPER",
+    "TRUTH",
+    "Cell",
+    "Trial",
+    "method_names",
+    "run_cell",
+    "summarise",
+]
 
 ENGINE = "engine"
 PAPER = "engine, paper's method"
 ORACLE = "true pairs"  # Procrustes on the true correspondences: the limit
+TRUTH = "ICP from the truth"  # whether the points alone hold the pose in place
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +93,7 @@ Method = Callable[[PointSetProblem], Outcome]
 
 def method_names() -> list[str]:
     """Every method that can be tried here, ours first."""
-    return [ENGINE, PAPER, ORACLE, *point_baselines()]
+    return [ENGINE, PAPER, ORACLE, TRUTH, *point_baselines()]
 
 
 def run_cell(
@@ -147,6 +158,7 @@ def _methods(cell: Cell) -> dict[str, Method]:
         ENGINE: _engine(RegistrationConfig()),
         PAPER: _engine(RegistrationConfig(method="gmrbnb", sigma_m=0.1)),
         ORACLE: _oracle,
+        TRUTH: _from_truth,
     }
     for name, matcher in point_baselines(cell.noise_m, share).items():
         methods[name] = _baseline(matcher)
@@ -172,3 +184,15 @@ def _baseline(matcher: Callable[..., Any]) -> Method:
 def _oracle(problem: PointSetProblem) -> Outcome:
     pairs = problem.source[problem.source_index], problem.target[problem.target_index]
     return procrustes(*pairs), False
+
+
+def _from_truth(problem: PointSetProblem) -> Outcome:
+    cutoff_m = max(0.05, 2.5 * problem.noise_m)
+    found = icp(
+        problem.source,
+        problem.target,
+        T_initial=problem.T_target_source,
+        first_cutoff_m=cutoff_m,
+        last_cutoff_m=cutoff_m,
+    )
+    return found.T_target_source, False
