@@ -43,6 +43,7 @@ FloatArray = NDArray[np.float64]
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _WALL, _FREE, _UNKNOWN = (0.08, 0.08, 0.10), (1.0, 1.0, 1.0), (0.80, 0.82, 0.84)
 _AGREE, _EXTRA, _MISSING = (0.10, 0.10, 0.12), (0.835, 0.369, 0.0), (0.0, 0.447, 0.698)
+_SEEN = (0.93, 0.94, 0.95)
 _INK = "#1c2733"
 _MAX_PIXELS = 1600
 _MARGIN_CELLS = 12
@@ -205,7 +206,7 @@ def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure |
     near_found = _near(found > 50, tolerance_cells)
     picture = np.empty((*spec.shape, 3))
     picture[:] = _UNKNOWN
-    picture[(found >= 0) | (true >= 0)] = (0.93, 0.94, 0.95)
+    picture[(found >= 0) | (true >= 0)] = _SEEN
     picture[found >= 0] = _FREE
     picture[(true > 50) & ~near_found] = _MISSING
     picture[(found > 50) & near_true] = _AGREE
@@ -219,6 +220,8 @@ def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure |
             Patch(color=_AGREE, label="wall, and there is one within 0.25 m"),
             Patch(color=_EXTRA, label="wall, and there is none"),
             Patch(color=_MISSING, label="true wall that was missed"),
+            Patch(facecolor=_FREE, edgecolor="#999999", label="known"),
+            Patch(facecolor=_SEEN, edgecolor="#999999", label="seen, but not in the map"),
         ],
     )
     _title(axes, "the merged map against the true one")
@@ -257,7 +260,7 @@ def overlay(
     found, true = resample(source, spec, T_target_source), resample(target, spec)
     picture = np.empty((*spec.shape, 3))
     picture[:] = _UNKNOWN
-    picture[(found >= 0) ^ (true >= 0)] = (0.93, 0.94, 0.95)
+    picture[(found >= 0) ^ (true >= 0)] = _SEEN
     picture[(found >= 0) & (true >= 0)] = _FREE
     tolerance_cells = 2.0
     both = (true > 50) & _near(found > 50, tolerance_cells)
@@ -400,8 +403,8 @@ def _draw_way(axes: Axes, trajectory: Trajectory, color: str) -> None:
         return
     axes.plot(poses[:, 0], poses[:, 1], color="white", lw=3.0, alpha=0.8, solid_capstyle="round")
     axes.plot(poses[:, 0], poses[:, 1], color=color, lw=1.6, solid_capstyle="round")
-    axes.plot(*poses[0, :2], "o", color=color, mec="white", mew=1.0, ms=7)
-    axes.plot(*poses[-1, :2], "s", color=color, mec="white", mew=1.0, ms=6)
+    for place, mark in ((poses[0], "o"), (poses[-1], "s")):
+        axes.plot(*place[:2], mark, color=color, mec="white", mew=1.0, ms=7, clip_on=False)
 
 
 def _draw_seam(axes: Axes, grid: OccupancyMap, T_map_submap: SE2, color: str) -> None:

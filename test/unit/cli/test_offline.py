@@ -1,0 +1,88 @@
+"""The offline command on a tiny simulated mission."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from uw_dslam_ros2.cli import offline
+from uw_dslam_ros2.io.bags import BagReader, open_bag
+from uw_dslam_ros2.sim.mission import tiny_mission_config
+from uw_dslam_ros2.sim.recording import RecordedMission, simulate_mission
+
+# Coarser than the default: what is tested here is the way of the data, not the quality.
+SETTINGS = """
+/**:
+  ros__parameters:
+    mapper.occupancy.resolution_m: 0.2
+"""
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory: pytest.TempPathFactory) -> RecordedMission:
+    """Two vehicles that see nearly the same place."""
+    return simulate_mission(tmp_path_factory.mktemp("missions") / "tiny", tiny_mission_config(1))
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file()
+    }
+
+
+@pytest.mark.slow
+def test_offline_merges_and_gives_the_same_bytes_again(mission, tmp_path, capsys) -> None:
+    settings = tmp_path / "settings.yaml"
+    settings.write_text(SETTINGS)
+    bags = [str(bag) for bag in mission.bags]
+    common = ["--config", str(settings), "--no-report"]
+    # The order in which the bags are named must not matter either.
+    assert offline.main([*bags, "--out", str(tmp_path / "a"), *common]) == 0
+    assert "vehicles merged" in capsys.readouterr().out
+    assert offline.main([*bags, "--out", str(tmp_path / "b"), *common]) == 0
+    first, second = _files(tmp_path / "a"), _files(tmp_path / "b")
+    assert first == second
+    assert {"global_map.pgm", "pose_graph.g2o", "report.json"} <= set(first)
+    report = json.loads(first["report.json"])
+    assert report["num_vehicles"] == 2
+    assert report["settings"]["mapper"]["auv_1"]["occupancy"]["resolution_m"] == 0.2
+    # The truth beside the bags was found, and the vehicles' own maps are straight.
+    assert max(report["scores"]["rmse_m_of_each_vehicle_alone"].values()) < 1.0
+
+
+def test_two_bags_of_one_vehicle_are_refused(mission, tmp_path, capsys) -> None:
+    bag = str(mission.bags[0])
+    assert offline.main([bag, bag, "--out", str(tmp_path / "out")]) == 2
+    assert "two bags are of auv_1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_truncated_bag_is_named(mission, tmp_path, capsys) -> None:
+    copy = tmp_path / "cut"
+    copy.mkdir()
+    for file in mission.bags[0].iterdir():
+        content = file.read_bytes()
+        (copy / file.name).write_bytes(content[:1000] if file.suffix == ".mcap" else content)
+    assert offline.main([str(copy), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("offline: error: ")
+    assert "cut" in error
+
+
+def test_settings_are_checked_before_anything_is_mapped(mission, tmp_path, capsys) -> None:
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("mapper: {submap: {max_lenght_m: 10.0}}")
+    arguments = [str(mission.bags[0]), "--out", str(tmp_path / "out"), "--config", str(settings)]
+    assert offline.main(arguments) == 2
+    assert "did you mean max_length_m?" in capsys.readouterr().err
+
+
+def test_a_bag_belongs_to_one_vehicle(mission) -> None:
+    for vehicle_id, bag in zip(mission.vehicle_ids, mission.bags, strict=True):
+        assert offline.vehicle_of_bag(bag) == vehicle_id
+        with open_bag(bag) as reader:
+            assert isinstance(reader, BagReader)

@@ -1,0 +1,143 @@
+"""The report says what happened, the bad things too."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from unit.cli import missions
+
+from uw_dslam_ros2.cli import pictures
+from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
+from uw_dslam_ros2.cli.scoring import Scores, Truth, read_truth, score
+from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.trajectories import write_tum
+
+FACTS = RunFacts(
+    "A <title>", ["bag_1"], "offline", {"queue": {"mode": "graph"}}, {"mission": 3}, {}
+)
+
+
+def _scores(truth: Truth | None) -> Scores:
+    outcome = missions.outcome()
+    own = {v.vehicle_id: v.own_trajectory for v in outcome.vehicles}
+    return score(outcome.global_map, outcome.trajectories(), own, truth)
+
+
+def test_a_planted_merge_has_no_error() -> None:
+    scores = _scores(missions.truth())
+    assert scores.trajectory is not None
+    assert scores.trajectory.rmse_m < 1e-3
+    assert set(scores.trajectory.per_vehicle_rmse_m) == {"auv_1", "auv_2"}
+    assert set(scores.alone_rmse_m) == {"auv_1", "auv_2", "auv_3"}
+
+
+def test_a_vehicle_in_a_wrong_place_counts_as_wrong() -> None:
+    truth = missions.truth()
+    stamps_ns, poses = truth.trajectories["auv_2"]
+    truth.trajectories["auv_2"] = stamps_ns, poses + np.array([5.0, 0.0, 0.0])
+    scores = _scores(truth)
+    assert scores.trajectory is not None
+    assert scores.trajectory.rmse_m > 0.5
+    assert scores.alone_rmse_m["auv_2"] < 1e-6
+
+
+def test_the_headline_names_who_is_not_merged() -> None:
+    text = headline(missions.outcome(), _scores(missions.truth()))
+    assert "2 of 3 vehicles merged (NOT merged: auv_3)" in text
+    assert "0.00 m RMSE" in text
+    assert "no truth" in headline(missions.outcome(), _scores(None))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A written report of the hand-made mission."""
+    path = tmp_path_factory.mktemp("report")
+    write_report(path, missions.outcome(), FACTS, missions.truth())
+    return path
+
+
+def test_the_report_is_one_file_that_says_all(folder: Path) -> None:
+    html = (folder / "report.html").read_text()
+    assert "A &lt;title&gt;" in html
+    assert "the maps share 2% of &lt;their&gt; area" in html
+    assert "auv_3 is not in the merged map" in html
+    assert html.count("NOT_ENOUGH_OVERLAP") >= 2
+    sources = re.findall(r'src="([^"]*)"', html)
+    assert sources
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert not re.search(r'(href|src)="http', html)
+
+
+def test_the_numbers_are_there_without_times(folder: Path) -> None:
+    report = json.loads((folder / "report.json").read_text())
+    assert report["num_vehicles_merged"] == 2
+    assert report["scores"]["trajectory"]["rmse_m"] < 1e-3
+    assert report["seeds"] == {"mission": 3}
+    assert "times_s" not in report
+    assert sum(report["verdicts"].values()) == report["num_registrations"]
+
+
+def test_pictures_are_not_empty(folder: Path) -> None:
+    for name in ("before_after", "trajectory_error"):
+        image = cv2.imread(str(folder / f"{name}.png"))
+        assert image is not None
+        assert image.shape[1] > 600
+        assert image.std() > 10.0
+
+
+@pytest.mark.parametrize("num_vehicles", [1, 2, 3])
+def test_any_number_of_vehicles_can_be_drawn(num_vehicles: int) -> None:
+    vehicles = ("auv_1", "auv_2", "auv_3")[:num_vehicles]
+    figure = pictures.before_after(missions.outcome(vehicles), "title")
+    # One for each vehicle and one for all.
+    assert len(figure.axes) == num_vehicles + 1
+    boxes = [axes.get_position() for axes in figure.axes]
+    for box in boxes:
+        assert 0.0 <= box.x0 < box.x1 <= 1.0
+        assert 0.0 <= box.y0 < box.y1 <= 1.0
+    for i, a in enumerate(boxes):
+        for b in boxes[:i]:
+            assert a.x0 >= b.x1 or b.x0 >= a.x1 or a.y0 >= b.y1 or b.y0 >= a.y1
+
+
+def test_a_thin_wall_survives_the_reduction() -> None:
+    num_cells = 4000
+    values = np.zeros((8, num_cells), dtype=np.int8)
+    values[:, 1001] = 100
+    occupancy = OccupancyMap(GridSpec(0.05, 8, num_cells), values)
+    figure, axes = pictures._single(occupancy.spec)
+    pictures._show_map(axes, occupancy)
+    shown = np.asarray(axes.images[0].get_array())
+    assert shown.shape[1] <= 1600
+    assert (shown.sum(axis=2) < 0.5).any(axis=1).all()
+    assert figure.axes == [axes]
+
+
+def test_a_rotated_map_is_drawn_where_it_lies() -> None:
+    values = np.zeros((10, 30), dtype=np.int8)
+    spec = GridSpec(1.0, 10, 30, SE2(5.0, 0.0, np.pi / 2))
+    _, axes = pictures._single(spec)
+    pictures._show_map(axes, OccupancyMap(spec, values))
+    assert axes.get_xlim() == pytest.approx((-5.0, 5.0))
+    assert axes.get_ylim() == pytest.approx((0.0, 30.0))
+
+
+def test_truth_is_read_from_a_folder_or_a_file(tmp_path: Path) -> None:
+    write_tum(tmp_path / "auv_1.tum", missions.STAMPS, missions.WAY)
+    assert read_truth(tmp_path).map is None
+    write_map(tmp_path / "map", missions.room())
+    truth = read_truth(tmp_path)
+    assert truth.map is not None
+    assert list(truth.trajectories) == list(read_truth(tmp_path / "auv_1.tum").trajectories)
+    with pytest.raises(DataError, match=r"holds no \.tum file"):
+        read_truth(tmp_path.parent)
+    with pytest.raises(DataError, match="does not exist"):
+        read_truth(tmp_path / "nothing")
