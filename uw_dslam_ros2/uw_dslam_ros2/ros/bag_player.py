@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any
 
 import rclpy
@@ -26,10 +26,10 @@ from rclpy.utilities import remove_ros_args, try_shutdown
 from rosgraph_msgs.msg import Clock as ClockMsg
 from std_srvs.srv import SetBool
 
-from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import ConfigError, DataError, UwDslamError
 from uw_dslam_ros2.io.recordings import BagReader, RawMessage, open_bags
 from uw_dslam_ros2.ros.conversions import stamp_ns_from_msg, stamp_to_msg
+from uw_dslam_ros2.ros.node_settings import BagPlayerConfig
 from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.playback import Pacer
 from uw_dslam_ros2.ros.qos import CLOCK, DEFAULT, PLAYBACK, STATIC_TF
@@ -40,36 +40,6 @@ _STATIC = "/tf_static"
 _OWN_TOPICS = ("/clock", "/rosout", "/parameter_events")
 _SETTLED_S = 1.0
 _MAX_HOLD_S = 20.0
-
-
-@dataclass(frozen=True, slots=True)
-class BagPlayerConfig(Config):
-    """Settings of the bag player."""
-
-    bags: tuple[str, ...] = setting(
-        (), doc="rosbag2 folders, .mcap or .db3 files; several play on one clock"
-    )
-    rate: float = setting(1.0, 0.01, 10000.0, "recorded seconds played per second")
-    start_s: float = setting(0.0, 0.0, 1e7, "begin this long after the first message [s]")
-    duration_s: float = setting(0.0, 0.0, 1e7, "play this much [s]; 0: to the end")
-    is_looping: bool = setting(False, doc="begin again at the end; /clock jumps back then")
-    is_paused: bool = setting(False, doc="wait for ~/pause (data: false) before playing")
-    clock_hz: float = setting(
-        100.0, 1.0, 10000.0, "at most this rate of /clock, in recorded time [Hz]"
-    )
-    topics: tuple[str, ...] = setting((), doc="only these topics (and /tf_static); empty: all")
-    wait_s: float = setting(
-        30.0, 0.0, 3600.0, "longest wait for readers of every bag before the first message [s]"
-    )
-    wait_for: tuple[str, ...] = setting(
-        (), doc="topics that must have a reader before the first message"
-    )
-    max_lag_s: float = setting(
-        0.0,
-        0.0,
-        1000.0,
-        "hold while a vehicle's odom is this far behind its bag [s]; 0: never",
-    )
 
 
 class BagPlayer(Node):

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from uw_dslam_msgs.srv import (
 )
 from visualization_msgs.msg import MarkerArray
 
-from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest, SubmapState
@@ -51,6 +49,7 @@ from uw_dslam_ros2.ros.merge_messages import (
     graph_to_markers,
     record_to_msg,
 )
+from uw_dslam_ros2.ros.node_settings import MapQueueManagerConfig
 from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.qos import LATCHED, SUBMAPS
 from uw_dslam_ros2.ros.registration_clients import RegistrationClients
@@ -64,33 +63,6 @@ _TICK_S = 0.1
 _STATUS_PERIOD_S = 1.0
 _DISCOVERY_PERIOD_S = 0.5
 _SERVICE_TIMEOUT_S = 600.0
-
-
-@dataclass(frozen=True, slots=True)
-class MapQueueManagerConfig(Config):
-    """Settings of the manager as a node; `queue` holds those of the map queue itself."""
-
-    vehicles: tuple[str, ...] = setting(
-        (), doc="vehicles whose submaps are taken; empty: every topic of type Submap on the graph"
-    )
-    servers: tuple[str, ...] = setting(
-        (), doc="registration servers (node names) that are asked; empty: all on the graph"
-    )
-    map_frame: str = setting("map", doc="frame of the global map")
-    requests_per_server: int = setting(2, 1, 1000, "registrations asked of one server at a time")
-    request_timeout_s: float = setting(
-        180.0, 0.1, 86400.0, "a registration not answered by then is asked again [s]"
-    )
-    publish_period_s: float = setting(
-        1.0, 0.0, 3600.0, "least time between two global maps, by a steady clock [s]"
-    )
-    full_map_period_s: float = setting(
-        5.0, 0.0, 3600.0, "between two whole maps while only parts change: those go as updates [s]"
-    )
-    session: str = setting(
-        "",
-        doc="folder: read at the start where it exists, written after every change; empty: none",
-    )
 
 
 class MapQueueManager(Node):

@@ -19,6 +19,7 @@ from rclpy.parameter import Parameter
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.settings import SECTIONS
+from uw_dslam_ros2.ros.node_settings import names_of_all_nodes
 
 __all__ = ["declare_config", "refuse_unknown_parameters", "settings_of"]
 
@@ -107,12 +108,13 @@ def _declare(node: Node, name: str, field: dataclasses.Field[Any], kind: Paramet
 def refuse_unknown_parameters(node: Node) -> None:
     """Raise `ConfigError` if the node was given a parameter that it does not have.
 
-    One file may hold the groups of all nodes under ``/**``: a node skips the others' groups.
+    One file may hold the parameters of all nodes under ``/**``: a node skips the others'.
     """
+    anothers = names_of_all_nodes()
     own = {name.split(".")[0] for name in _declared(node)}
     for name in sorted(_given(node)):
         head = name.split(".")[0]
-        is_anothers = head in SECTIONS and head not in own
+        is_anothers = name in anothers or (head in SECTIONS and head not in own)
         if (
             node.has_parameter(name)
             or name in _OWN_TO_RCLPY

@@ -9,7 +9,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from rclpy.node import Node
 from uw_dslam_msgs.action import RegisterMaps as RegisterMapsAction
 from uw_dslam_msgs.srv import RegisterMaps, RegisterPointSets
 
-from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError, InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration import (
@@ -40,6 +39,7 @@ from uw_dslam_ros2.ros.conversions import (
     transform2d_to_msg,
 )
 from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.node_settings import RegistrationServerConfig
 from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.registration_jobs import Job, RegistrationJobs, Search
 from uw_dslam_ros2.ros.running import run_node
@@ -50,18 +50,6 @@ _FEEDBACK_PERIOD_S = 0.25
 _POLL_S = 0.02
 _CANCEL_PATIENCE_S = 0.05
 _NUM_LATENCIES = 200
-
-
-@dataclass(frozen=True, slots=True)
-class RegistrationServerConfig(Config):
-    """Settings of the registration server."""
-
-    max_parallel: int = setting(0, 0, 256, "searches at a time; 0: as many as cores")
-    max_waiting: int = setting(4, 0, 1000, "requests that wait for their turn; more get BUSY")
-    max_cells: int = setting(
-        36_000_000, 1, 1_000_000_000, "largest map that is accepted, in cells (6000 x 6000)"
-    )
-    max_points: int = setting(100_000, 1, 10_000_000, "largest point set that is accepted")
 
 
 class RegistrationServer(Node):

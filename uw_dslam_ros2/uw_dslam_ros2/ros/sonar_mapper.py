@@ -6,7 +6,6 @@ import functools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from geometry_msgs.msg import TwistWithCovarianceStamped
@@ -19,7 +18,6 @@ from sensor_msgs.msg import FluidPressure, Imu, LaserScan, PointCloud2
 from std_srvs.srv import Trigger
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
-from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import ConfigError, InvalidInputError
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.submap import Submap
@@ -33,6 +31,7 @@ from uw_dslam_ros2.io.events import (
     ScanEvent,
     VelocityEvent,
 )
+from uw_dslam_ros2.io.feeding import SensorEvent, feed
 from uw_dslam_ros2.ros.conversions import (
     occupancy_to_msg,
     path_to_msg,
@@ -41,13 +40,13 @@ from uw_dslam_ros2.ros.conversions import (
     submap_to_msg,
 )
 from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
-from uw_dslam_ros2.ros.feeding import SensorEvent, feed
 from uw_dslam_ros2.ros.frames import (
     WARNING_PERIOD_S,
     FrameBroadcaster,
     Mounts,
     transform_to_msg,
 )
+from uw_dslam_ros2.ros.node_settings import SonarMapperConfig
 from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
 from uw_dslam_ros2.ros.running import run_node
@@ -62,43 +61,6 @@ _MOUNT_PATIENCE_NS = 5_000_000_000
 _ODOM_PERIOD_NS = 100_000_000
 _FINISH_TIMEOUT_S = 600.0
 _IDLE_S = 4.0  # longer than the repair of a lost message takes
-
-
-@dataclass(frozen=True, slots=True)
-class SonarMapperConfig(Config):
-    """Settings of the sonar mapper as a node; `mapper` holds those of the mapping itself."""
-
-    vehicle_id: str = setting("", doc="the vehicle's name; empty: the node's namespace")
-    base_frame: str = setting("", doc="frame of the vehicle's body; empty: <vehicle>/base_link")
-    input: str = setting(
-        "image",
-        choices=("image", "scan", "points"),
-        doc="what the sonar sends: topic sonar, scan or points",
-    )
-    data_order: str = setting(
-        "range_major", choices=messages.DATA_ORDERS, doc="slowest index of a sonar image's bytes"
-    )
-    velocity: str = setting(
-        "dvl",
-        choices=("dvl", "twist"),
-        doc="type of the topic dvl: Dvl or TwistWithCovarianceStamped",
-    )
-    water_density_kg_m3: float = setting(
-        1025.0, 900.0, 1300.0, "turns pressure into depth; fresh water has 1000"
-    )
-    is_reliable: bool = setting(
-        False, doc="subscribe to sensors reliably: for replays, where nothing may be lost"
-    )
-    ping_queue: int = setting(100, 1, 100000, "pings kept while the mapper is busy")
-    sensor_queue: int = setting(5000, 1, 1000000, "other messages kept while the mapper is busy")
-    reorder_s: float = setting(
-        1.0, 0.0, 600.0, "a sensor is waited for this long, so that all is used in order [s]"
-    )
-    jump_back_s: float = setting(
-        1.0, 0.01, 1e6, "stamps that go back by more begin a new recording: all starts afresh [s]"
-    )
-    map_period_s: float = setting(2.0, 0.1, 3600.0, "between two maps, by the pings' stamps [s]")
-    path_max_poses: int = setting(2000, 2, 1000000, "a longer path is thinned when published")
 
 
 class SonarMapper(Node):
@@ -118,7 +80,7 @@ class SonarMapper(Node):
         self._base_frame = self._config.base_frame or f"{self._vehicle_id}/base_link"
         self._mapper = VehicleMapper(self._mapper_config, self._vehicle_id)
         self._order: StampOrder[SensorEvent] = StampOrder(
-            int(self._config.reorder_s * 1e9), int(self._config.jump_back_s * 1e9)
+            int(self._reorder_s() * 1e9), int(self._config.jump_back_s * 1e9)
         )
         self._counts: Counter[str] = Counter()
         self._mapper_values: dict[str, float | int | str] = {}
@@ -152,6 +114,11 @@ class SonarMapper(Node):
         """Stop, then destroy."""
         self.stop()
         super().destroy_node()
+
+    def _reorder_s(self) -> float:
+        """Live, a sensor that died must not hold up the others for long; in a replay it may."""
+        live_s, replay_s = 1.0, 60.0
+        return self._config.reorder_s or (replay_s if self._config.is_reliable else live_s)
 
     def _create_publishers(self) -> None:
         self._submap_pub = self.create_publisher(SubmapMsg, "submap", SUBMAPS)

@@ -1,0 +1,142 @@
+"""Settings of the nodes as nodes; those of what they drive are in the core."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.io.messages import DATA_ORDERS
+
+__all__ = [
+    "NODE_CONFIGS",
+    "BagPlayerConfig",
+    "MapQueueManagerConfig",
+    "RegistrationServerConfig",
+    "SonarMapperConfig",
+    "names_of_all_nodes",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class SonarMapperConfig(Config):
+    """Settings of the sonar mapper as a node; `mapper` holds those of the mapping itself."""
+
+    vehicle_id: str = setting("", doc="the vehicle's name; empty: the node's namespace")
+    base_frame: str = setting("", doc="frame of the vehicle's body; empty: <vehicle>/base_link")
+    input: str = setting(
+        "image",
+        choices=("image", "scan", "points"),
+        doc="what the sonar sends: topic sonar, scan or points",
+    )
+    data_order: str = setting(
+        "range_major", choices=DATA_ORDERS, doc="slowest index of a sonar image's bytes"
+    )
+    velocity: str = setting(
+        "dvl",
+        choices=("dvl", "twist"),
+        doc="type of the topic dvl: Dvl or TwistWithCovarianceStamped",
+    )
+    water_density_kg_m3: float = setting(
+        1025.0, 900.0, 1300.0, "turns pressure into depth; fresh water has 1000"
+    )
+    is_reliable: bool = setting(
+        False, doc="subscribe to sensors reliably: for replays, where nothing may be lost"
+    )
+    ping_queue: int = setting(100, 1, 100000, "pings kept while the mapper is busy")
+    sensor_queue: int = setting(5000, 1, 1000000, "other messages kept while the mapper is busy")
+    reorder_s: float = setting(
+        0.0,
+        0.0,
+        600.0,
+        "a sensor is waited for this long, to use all in order [s]; 0: 1, or 60 if reliable",
+    )
+    jump_back_s: float = setting(
+        1.0, 0.01, 1e6, "stamps that go back by more begin a new recording: all starts afresh [s]"
+    )
+    map_period_s: float = setting(2.0, 0.1, 3600.0, "between two maps, by the pings' stamps [s]")
+    path_max_poses: int = setting(2000, 2, 1000000, "a longer path is thinned when published")
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationServerConfig(Config):
+    """Settings of the registration server."""
+
+    max_parallel: int = setting(0, 0, 256, "searches at a time; 0: as many as cores")
+    max_waiting: int = setting(4, 0, 1000, "requests that wait for their turn; more get BUSY")
+    max_cells: int = setting(
+        36_000_000, 1, 1_000_000_000, "largest map that is accepted, in cells (6000 x 6000)"
+    )
+    max_points: int = setting(100_000, 1, 10_000_000, "largest point set that is accepted")
+
+
+@dataclass(frozen=True, slots=True)
+class MapQueueManagerConfig(Config):
+    """Settings of the manager as a node; `queue` holds those of the map queue itself."""
+
+    vehicles: tuple[str, ...] = setting(
+        (), doc="vehicles whose submaps are taken; empty: every topic of type Submap on the graph"
+    )
+    servers: tuple[str, ...] = setting(
+        (), doc="registration servers (node names) that are asked; empty: all on the graph"
+    )
+    map_frame: str = setting("map", doc="frame of the global map")
+    requests_per_server: int = setting(2, 1, 1000, "registrations asked of one server at a time")
+    request_timeout_s: float = setting(
+        180.0, 0.1, 86400.0, "a registration not answered by then is asked again [s]"
+    )
+    publish_period_s: float = setting(
+        1.0, 0.0, 3600.0, "least time between two global maps, by a steady clock [s]"
+    )
+    full_map_period_s: float = setting(
+        5.0, 0.0, 3600.0, "between two whole maps while only parts change: those go as updates [s]"
+    )
+    session: str = setting(
+        "",
+        doc="folder: read at the start where it exists, written after every change; empty: none",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class BagPlayerConfig(Config):
+    """Settings of the bag player."""
+
+    bags: tuple[str, ...] = setting(
+        (), doc="rosbag2 folders, .mcap or .db3 files; several play on one clock"
+    )
+    rate: float = setting(1.0, 0.01, 10000.0, "recorded seconds played per second")
+    start_s: float = setting(0.0, 0.0, 1e7, "begin this long after the first message [s]")
+    duration_s: float = setting(0.0, 0.0, 1e7, "play this much [s]; 0: to the end")
+    is_looping: bool = setting(False, doc="begin again at the end; /clock jumps back then")
+    is_paused: bool = setting(False, doc="wait for ~/pause (data: false) before playing")
+    clock_hz: float = setting(
+        100.0, 1.0, 10000.0, "at most this rate of /clock, in recorded time [Hz]"
+    )
+    topics: tuple[str, ...] = setting((), doc="only these topics (and /tf_static); empty: all")
+    wait_s: float = setting(
+        30.0, 0.0, 3600.0, "longest wait for readers of every bag before the first message [s]"
+    )
+    wait_for: tuple[str, ...] = setting(
+        (), doc="topics that must have a reader before the first message"
+    )
+    max_lag_s: float = setting(
+        0.0,
+        0.0,
+        1000.0,
+        "hold while a vehicle's odom is this far behind its bag [s]; 0: never",
+    )
+
+
+NODE_CONFIGS: dict[str, type[Config]] = {
+    "sonar_mapper": SonarMapperConfig,
+    "registration_server": RegistrationServerConfig,
+    "map_queue_manager": MapQueueManagerConfig,
+    "bag_player": BagPlayerConfig,
+}
+
+
+def names_of_all_nodes() -> frozenset[str]:
+    """Parameters that some node of ours has: one file under ``/**`` may serve all of them."""
+    return frozenset(
+        field.name for config in NODE_CONFIGS.values() for field in dataclasses.fields(config)
+    )
