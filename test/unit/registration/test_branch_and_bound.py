@@ -56,12 +56,17 @@ def some_problems(rng):
 
 
 def bound_box(problem, box):
-    out = np.zeros(6)
-    kernels.bound_box(
+    """Both bounds and the value at the centre."""
+    box, out = np.asarray(box), np.empty(5)
+    first = kernels.bound_first(
         problem.points, problem.rows, problem.frames, problem.levels, problem.level_of,
-        problem.coefficients, problem.bounds, problem.curvatures, np.asarray(box), out,
+        problem.bounds, box,
     )  # fmt: skip
-    return out
+    kernels.bound_second(
+        problem.points, problem.rows, problem.frames, problem.half_of, problem.coefficients,
+        problem.curvatures, box, out,
+    )  # fmt: skip
+    return first, out[0], out[1]
 
 
 @pytest.mark.parametrize("shrink", [1.0, 0.2, 0.05, 0.01, 0.001])

@@ -109,7 +109,7 @@ def test_a_prior_is_kept():
 
 
 def test_budget_and_cancel_end_a_match():
-    source, target = scene(np.random.default_rng(9), 30, 10, 30, 0.02)
+    source, target = scene(np.random.default_rng(9), 30, 30, 100, 0.02)
     short = register_point_sets(source, target, RegistrationConfig(max_boxes=100, gap=1e-4))
     stopped = register_point_sets(
         source, target, RegistrationConfig(gap=1e-4), is_cancelled=lambda: True

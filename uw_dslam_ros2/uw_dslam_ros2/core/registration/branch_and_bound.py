@@ -43,7 +43,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration import kernels
-from uw_dslam_ros2.core.registration.field import Field, num_curvature_levels
+from uw_dslam_ros2.core.registration.field import Field, curvature_spans
 from uw_dslam_ros2.core.registration.result import PriorWindow, Progress
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -52,7 +52,8 @@ __all__ = ["SearchOutcome", "SearchSettings", "Status", "Term", "objective_at", 
 FloatArray = NDArray[np.float64]
 
 _BOX_BYTES = 7 * 8 + 8 + 4
-_CHUNK = 4096  # boxes between two looks at the clock
+_SMALL = 7.0  # cells that a box may move the points by, for curvature to be tried
+_CHUNK = 2048  # boxes between two looks at the clock
 
 
 class Status(enum.Enum):
@@ -149,12 +150,11 @@ class Problem:
                     sizes[0],
                     *shape,
                     num_levels,
-                    num_curvature_levels(field.levels),
+                    sizes[2],
                 ]
             )
             frames.append([*(field.origin - others), field.pitch_m])
-            offsets = np.array([sizes[1], 0, 0, sizes[2]])
-            table = np.column_stack([field.levels, field.levels[:, 0]]) + offsets
+            table = field.levels + np.array([sizes[1], 0, 0])
             levels.append(table)
             num_points += len(term.points)
             num_levels += len(table)
@@ -165,14 +165,16 @@ class Problem:
         self.levels = np.ascontiguousarray(np.concatenate(levels))
         self.coefficients = _joined([term.field.coefficients.ravel() for term in self.terms])
         self.bounds = _joined([term.field.bounds for term in self.terms])
-        self.curvatures = _joined([term.field.curvatures for term in self.terms])
+        self.curvatures = _joined([term.field.curvatures.ravel() for term in self.terms])
         self.level_of = _level_table(int(self.rows[:, 4:6].max()))
+        self.half_of = curvature_spans()
         self.window = self._window()
         weights = self.points[:, 2]
         spread = (self.points[:, :2] ** 2).sum(axis=1)
         self.arm = math.sqrt(float((weights * spread).sum() / max(float(weights.sum()), 1e-300)))
         self.reach = 5.0 * max(term.field.pitch_m for term in self.terms)
         self.arm = max(self.arm, 1e-3 * self.reach)
+        self.small = _SMALL * min(term.field.pitch_m for term in self.terms)
         peak = sum(
             float(term.weights.sum()) * float(np.abs(term.field.coefficients).max())
             for term in self.terms
@@ -370,9 +372,9 @@ class _Search:
     def _run_chunk(self, max_boxes: int) -> None:
         p, settings = self._problem, self._settings
         kernels.run(
-            p.points, p.rows, p.frames, p.levels, p.level_of,
+            p.points, p.rows, p.frames, p.levels, p.level_of, p.half_of,
             p.coefficients, p.bounds, p.curvatures, p.window,
-            p.arm, p.reach, p.margin, settings.gap, settings.keep, max_boxes,
+            p.arm, p.reach, p.margin, p.small, settings.gap, settings.keep, max_boxes,
             self._boxes, self._keys, self._heap, self._counters, self._best, self._found,
         )  # fmt: skip
 

@@ -36,7 +36,7 @@ IntArray = NDArray[np.int64]
 
 _BORDER = 3  # zero coefficients around the content, so that the spline itself ends at zero
 _TAIL_SIGMAS = 6.0
-_NUM_CURVATURE_LEVELS = 6  # windows of up to 32 cells; larger boxes do not profit from curvature
+_NUM_CURVATURE_LEVELS = 5  # two windows of 16 cells: larger boxes do not profit from curvature
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +53,7 @@ class Field:
     coefficients: Float32Array  # (R, C)
     error: float  # proven bound of |spline - its formula|; 0 where the spline is the definition
     bounds: Float32Array  # flat, all levels of the maximum pyramid
-    curvatures: Float32Array  # flat, first levels of the pyramid of second derivatives [1 / m^2]
+    curvatures: Float32Array  # (5, R, C): largest second derivative [1 / m^2] in 2^k x 2^k cells
     levels: IntArray  # (L, 3): offset, number of columns, right-shift of a cell index
 
     @property
@@ -74,30 +74,42 @@ class Field:
 
     def upper_bound(self, low: ArrayLike, high: ArrayLike) -> float:
         """Proven upper bound over the rectangle from `low` (2,) to `high` (2,) [m]."""
-        return self._look_up(self.bounds, low, high, len(self.levels))
+        cells = self._cells(low, high)
+        if cells is None:
+            return 0.0
+        col, row, last_col, last_row = cells
+        for level, (offset, num_cols, shift) in enumerate(self.levels):
+            if max(last_col - col, last_row - row) <= (1 << level) - (1 << shift):
+                return float(self.bounds[offset + (row >> shift) * num_cols + (col >> shift)])
+        return math.inf
 
     def curvature_bound(self, low: ArrayLike, high: ArrayLike) -> float:
         """Proven upper bound of the second derivative in any direction [1 / m^2].
 
         Infinite where the rectangle is larger than the tables go.
         """
-        return self._look_up(self.curvatures, low, high, num_curvature_levels(self.levels))
+        cells = self._cells(low, high)
+        if cells is None:
+            return 0.0
+        col, row, last_col, last_row = cells
+        spans = curvature_spans()
+        span = max(last_col - col, last_row - row)
+        if span >= len(spans):
+            return math.inf
+        table, size = self.curvatures[spans[span]], 1 << int(spans[span])
+        rows, cols = [row, max(row, last_row - size + 1)], [col, max(col, last_col - size + 1)]
+        return float(table[np.ix_(rows, cols)].max())
 
-    def _look_up(self, table: Float32Array, low: ArrayLike, high: ArrayLike, count: int) -> float:
+    def _cells(self, low: ArrayLike, high: ArrayLike) -> tuple[int, int, int, int] | None:
+        """First column and row, last column and row that a rectangle touches."""
         num_rows, num_cols = self.coefficients.shape
         first = np.floor((np.asarray(low) - self.origin) / self.pitch_m + 0.5 - 1e-9).astype(int)
         last = np.floor((np.asarray(high) - self.origin) / self.pitch_m + 0.5 + 1e-9).astype(int)
         if (last < 0).any() or first[0] >= num_cols or first[1] >= num_rows:
-            return 0.0
+            return None
         first = np.maximum(first, 0)
         last = np.minimum(last, [num_cols - 1, num_rows - 1])
-        for level in range(count):
-            offset, stride_cols, shift = self.levels[level]
-            if (last - first).max() <= (1 << level) - (1 << shift):
-                return float(
-                    table[offset + (first[1] >> shift) * stride_cols + (first[0] >> shift)]
-                )
-        return math.inf
+        return int(first[0]), int(first[1]), int(last[0]), int(last[1])
 
 
 def field_from_samples(
@@ -166,7 +178,7 @@ def likelihood_field(
     sigmas_m: FloatArray,
     contrast: float,
     *,
-    nodes_per_sigma: float = 4.0,
+    nodes_per_sigma: float = 3.0,
     max_nodes: int = 25_000_000,
 ) -> Field:
     """Log of a likelihood ratio, ``log(1 + c S(p)) / log(1 + c)`` with S the mixture's field.
@@ -189,9 +201,9 @@ def likelihood_field(
     return _with_tables(coefficients.astype(np.float32), low, pitch_m, 0.0)
 
 
-def num_curvature_levels(levels: IntArray) -> int:
-    """How many levels the pyramid of second derivatives has."""
-    return min(len(levels), _NUM_CURVATURE_LEVELS)
+def curvature_spans() -> NDArray[np.int8]:
+    """For every span, the level of which two overlapping windows hold exactly span + 1 cells."""
+    return np.log2(np.arange(1, 1 << _NUM_CURVATURE_LEVELS)).astype(np.int8)
 
 
 def _lattice(
@@ -270,13 +282,11 @@ def _with_tables(
             break
         level += 1
     table = np.array(levels, dtype=np.int64)
-    num_curved = num_curvature_levels(table)
-    end = offset if num_curved == len(table) else int(table[num_curved, 0])
     bounds = np.empty(offset, dtype=np.float32)
-    curvatures = np.empty(end, dtype=np.float32)
-    field_kernels.fill_first_level(coefficients, 1.0 / pitch_m**2, bounds, curvatures)
+    curvatures = np.empty((_NUM_CURVATURE_LEVELS, num_rows, num_cols), dtype=np.float32)
+    field_kernels.fill_first_level(coefficients, 1.0 / pitch_m**2, bounds, curvatures[0].ravel())
     field_kernels.fill_pyramid(bounds, table, len(table), num_rows)
-    field_kernels.fill_pyramid(curvatures, table, num_curved, num_rows)
+    field_kernels.fill_windows(curvatures)
     return Field(
         np.asarray(origin, dtype=np.float64),
         pitch_m,

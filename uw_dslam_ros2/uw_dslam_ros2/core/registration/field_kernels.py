@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["add_gaussians", "fill_first_level", "fill_pyramid", "spline_values"]
+__all__ = ["add_gaussians", "fill_first_level", "fill_pyramid", "fill_windows", "spline_values"]
 
 
 @njit(cache=True, nogil=True)
@@ -138,4 +138,21 @@ def fill_pyramid(table, levels, num_levels, num_rows):
                         table[below + bottom * below_cols + left],
                         table[below + bottom * below_cols + right],
                     ),
+                )
+
+
+@njit(cache=True, nogil=True)
+def fill_windows(tables):
+    """``tables[k]``: maxima over 2^k x 2^k cells from each cell on, clipped at the edge."""
+    num_levels, num_rows, num_cols = tables.shape
+    for level in range(1, num_levels):
+        half = 1 << (level - 1)
+        below = tables[level - 1]
+        for row in range(num_rows):
+            top = min(row + half, num_rows - 1)
+            for col in range(num_cols):
+                right = min(col + half, num_cols - 1)
+                tables[level, row, col] = max(
+                    max(below[row, col], below[row, right]),
+                    max(below[top, col], below[top, right]),
                 )

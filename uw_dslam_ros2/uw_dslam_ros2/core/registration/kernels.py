@@ -3,11 +3,11 @@
 
 Everything is flat arrays. ``points`` (K, 4) hold x, y, weight and nothing; ``terms`` (T, 8)
 integers: first point, end point, is_inverse, offset of the coefficients, rows, columns, first
-level, number of curvature levels; ``frames`` (T, 3): origin x, y and pitch; ``levels`` (L, 4):
-offset of the bounds, columns, shift, offset of the curvatures, of all fields after each other;
-``level_of[span]``: the level whose windows hold ``span + 1`` cells wherever they start. ``heap``
-holds every slot of ``boxes`` once: the open ones as a binary heap by ``keys``, behind them the
-free ones.
+level, offset of the curvatures; ``frames`` (T, 3): origin x, y and pitch; ``levels`` (L, 3):
+offset of the bounds, columns, shift, of all fields after each other; ``level_of[span]``: the level
+whose windows hold ``span + 1`` cells wherever they start; ``half_of[span]``: that of which two
+overlapping windows hold them exactly. ``heap`` holds every slot of ``boxes`` once: the open ones
+as a binary heap by ``keys``, behind them the free ones.
 
 A box is (theta, x, y, half theta, half x, half y). The motion is ``p = R(theta) x + t`` for a
 forward term and ``p = R(theta)^T (y - t)`` for an inverse one.
@@ -20,120 +20,155 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["ascend", "bound_box", "evaluate", "run"]
+__all__ = ["ascend", "bound_first", "bound_second", "evaluate", "run"]
 
 # Slots of the search's counters and of its best pose.
-NUM_OPEN, NUM_BOXES, NUM_ASCENTS, NUM_FOUND, STATUS = range(5)
+NUM_OPEN, NUM_BOXES, NUM_SECOND, NUM_FOUND, STATUS = range(5)
 DONE, CHUNK_ENDED, HEAP_FULL = range(3)
 
 
 @njit(cache=True, nogil=True)
-def bound_box(points, terms, frames, levels, level_of, coefficients, bounds, curvatures, box, out):
-    """Upper bounds of the objective over a box, and its value at the centre.
+def _reach(cos, sin, tx, ty, h_x, h_y, swing, bow, is_inverse, x, y):
+    """Turned point (about the centre of rotation), its place, and the rectangle a box takes it to.
 
-    ``out``: first-order bound, second-order bound (inf if not tried), value at the centre, and the
-    share of the second-order bound's slack that theta, x and y have.
+    Returns the turned point, its place at the centre of the box, and middle and half widths of the
+    rectangle. A turn by delta moves a turned point r by sin(delta) J r - (1 - cos(delta)) r.
     """
-    theta, tx, ty = box[0], box[1], box[2]
-    h_theta, h_x, h_y = box[3], box[4], box[5]
-    cos, sin = math.cos(theta), math.sin(theta)
-    swing = math.sin(h_theta) if h_theta < 0.5 * math.pi else 1.0
-    bow = 1.0 - math.cos(min(h_theta, math.pi))
-    eps_x = abs(cos) * h_x + abs(sin) * h_y
-    eps_y = abs(sin) * h_x + abs(cos) * h_y
+    if is_inverse:
+        rx = cos * (x - tx) + sin * (y - ty)
+        ry = -sin * (x - tx) + cos * (y - ty)
+        e_x = abs(cos) * h_x + abs(sin) * h_y
+        e_y = abs(sin) * h_x + abs(cos) * h_y
+        half_x = e_x * (1.0 + bow) + swing * (abs(ry) + e_y) + 0.5 * bow * abs(rx)
+        half_y = e_y * (1.0 + bow) + swing * (abs(rx) + e_x) + 0.5 * bow * abs(ry)
+        return rx, ry, rx, ry, rx - 0.5 * bow * rx, ry - 0.5 * bow * ry, half_x, half_y
+    rx = cos * x - sin * y
+    ry = sin * x + cos * y
+    px, py = rx + tx, ry + ty
+    half_x = h_x + swing * abs(ry) + 0.5 * bow * abs(rx)
+    half_y = h_y + swing * abs(rx) + 0.5 * bow * abs(ry)
+    return rx, ry, px, py, px - 0.5 * bow * rx, py - 0.5 * bow * ry, half_x, half_y
+
+
+@njit(cache=True, nogil=True)
+def bound_first(points, terms, frames, levels, level_of, bounds, box):
+    """Upper bound over a box: every point at the best place that it can reach."""
+    cos, sin = math.cos(box[0]), math.sin(box[0])
+    swing = math.sin(box[3]) if box[3] < 0.5 * math.pi else 1.0
+    bow = 1.0 - math.cos(min(box[3], math.pi))
+    tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
     total = 0.0
+    for t in range(terms.shape[0]):
+        is_inverse = terms[t, 2] != 0
+        num_rows, num_cols, first_level = terms[t, 4], terms[t, 5], terms[t, 6]
+        scale = 1.0 / frames[t, 2]
+        shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
+        for k in range(terms[t, 0], terms[t, 1]):
+            _, _, _, _, mid_x, mid_y, half_x, half_y = _reach(
+                cos, sin, tx, ty, h_x, h_y, swing, bow, is_inverse, points[k, 0], points[k, 1]
+            )
+            u, v = mid_x * scale + shift_x, mid_y * scale + shift_y
+            eu, ev = half_x * scale + 1e-9, half_y * scale + 1e-9
+            if u + eu < 0.0 or v + ev < 0.0 or u - eu >= num_cols or v - ev >= num_rows:
+                continue
+            i0, j0 = int(max(u - eu, 0.0)), int(max(v - ev, 0.0))
+            i1, j1 = int(min(u + eu, num_cols - 1.0)), int(min(v + ev, num_rows - 1.0))
+            row = first_level + level_of[max(i1 - i0, j1 - j0)]
+            shift = levels[row, 2]
+            at = levels[row, 0] + (j0 >> shift) * levels[row, 1] + (i0 >> shift)
+            total += points[k, 2] * bounds[at]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _largest_curvature(curvatures, at, num_rows, num_cols, half_of, i0, j0, i1, j1):
+    """Exact maximum over a rectangle of cells, from four overlapping windows."""
+    level = half_of[max(i1 - i0, j1 - j0)]
+    size = 1 << level
+    at += level * num_rows * num_cols
+    right, top = max(i1 - size + 1, i0), max(j1 - size + 1, j0)
+    low, high = at + j0 * num_cols, at + top * num_cols
+    return max(
+        max(curvatures[low + i0], curvatures[low + right]),
+        max(curvatures[high + i0], curvatures[high + right]),
+    )
+
+
+@njit(cache=True, nogil=True)
+def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, out):
+    """Upper bound over a small box from value, summed gradient and bounded curvature.
+
+    ``out``: the bound, the value at the centre, and the rise that theta, x and y can bring. The
+    bound is infinite where the box is too large for the tables.
+    """
+    cos, sin = math.cos(box[0]), math.sin(box[0])
+    swing, bow = math.sin(box[3]), 1.0 - math.cos(box[3])
+    tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
     value = 0.0
-    is_small = h_theta < 0.5
     g_x, g_y, g_theta = 0.0, 0.0, 0.0
     all_a, b_x, b_y, m33, e_x, e_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    out[0], out[1] = math.inf, -math.inf
     for t in range(terms.shape[0]):
         is_inverse = terms[t, 2] != 0
         at_coefficients, num_rows, num_cols = terms[t, 3], terms[t, 4], terms[t, 5]
-        first_level, num_curved = terms[t, 6], terms[t, 7]
-        origin_x, origin_y, scale = frames[t, 0], frames[t, 1], 1.0 / frames[t, 2]
+        at_curvatures = terms[t, 7]
+        scale = 1.0 / frames[t, 2]
+        shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
         s0, sx, sy, s_theta, s_radial = 0.0, 0.0, 0.0, 0.0, 0.0
         la, lx, ly, lc = 0.0, 0.0, 0.0, 0.0
         for k in range(terms[t, 0], terms[t, 1]):
-            x, y, weight = points[k, 0], points[k, 1], points[k, 2]
-            if is_inverse:
-                rx = cos * (x - tx) + sin * (y - ty)
-                ry = -sin * (x - tx) + cos * (y - ty)
-                px, py = rx, ry
-                ex = eps_x * (1.0 + 0.5 * bow) + swing * (abs(ry) + eps_y) + 0.5 * bow * abs(rx)
-                ey = eps_y * (1.0 + 0.5 * bow) + swing * (abs(rx) + eps_x) + 0.5 * bow * abs(ry)
-                ex += 0.5 * bow * eps_x
-                ey += 0.5 * bow * eps_y
-            else:
-                rx = cos * x - sin * y
-                ry = sin * x + cos * y
-                px, py = rx + tx, ry + ty
-                ex = h_x + swing * abs(ry) + 0.5 * bow * abs(rx)
-                ey = h_y + swing * abs(rx) + 0.5 * bow * abs(ry)
-            u = (px - origin_x) * scale + 0.5
-            v = (py - origin_y) * scale + 0.5
-            mid_u = u - 0.5 * bow * rx * scale
-            mid_v = v - 0.5 * bow * ry * scale
-            ex = ex * scale + 1e-9
-            ey = ey * scale + 1e-9
-            if (
-                mid_u + ex < 0.0
-                or mid_v + ey < 0.0
-                or mid_u - ex >= num_cols
-                or mid_v - ey >= num_rows
-            ):
+            rx, ry, px, py, mid_x, mid_y, half_x, half_y = _reach(
+                cos, sin, tx, ty, h_x, h_y, swing, bow, is_inverse, points[k, 0], points[k, 1]
+            )
+            weight = points[k, 2]
+            u, v = mid_x * scale + shift_x, mid_y * scale + shift_y
+            eu, ev = half_x * scale + 1e-9, half_y * scale + 1e-9
+            if u + eu < 0.0 or v + ev < 0.0 or u - eu >= num_cols or v - ev >= num_rows:
                 continue
-            i0 = max(math.floor(mid_u - ex), 0)
-            j0 = max(math.floor(mid_v - ey), 0)
-            i1 = min(math.floor(mid_u + ex), num_cols - 1)
-            j1 = min(math.floor(mid_v + ey), num_rows - 1)
-            level = level_of[max(i1 - i0, j1 - j0)]
-            row = first_level + level
-            shift = levels[row, 2]
-            at = levels[row, 0] + (j0 >> shift) * levels[row, 1] + (i0 >> shift)
-            total += weight * bounds[at]
-            if level >= num_curved:
-                is_small = False
-            if is_small:
-                curvature = weight * curvatures[at - levels[row, 0] + levels[row, 3]]
-                la += curvature
-                lx += curvature * rx
-                ly += curvature * ry
-                lc += curvature * (rx * rx + ry * ry)
-                if 1.0 <= u < num_cols - 1 and 1.0 <= v < num_rows - 1:
-                    i, j = int(u), int(v)
-                    a, b = u - 0.5 - i, v - 0.5 - j
-                    a0, a1, a2 = 0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2
-                    b0, b1, b2 = 0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2
-                    at = at_coefficients + (j - 1) * num_cols + i - 1
-                    c00, c01, c02 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-                    at += num_cols
-                    c10, c11, c12 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-                    at += num_cols
-                    c20, c21, c22 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-                    line0 = a0 * c00 + a1 * c01 + a2 * c02
-                    line1 = a0 * c10 + a1 * c11 + a2 * c12
-                    line2 = a0 * c20 + a1 * c21 + a2 * c22
-                    s0 += weight * (b0 * line0 + b1 * line1 + b2 * line2)
-                    fy = (
-                        weight
-                        * scale
-                        * ((0.5 + b) * (line2 - line1) + (0.5 - b) * (line1 - line0))
-                    )
-                    slope0 = (0.5 + a) * (c02 - c01) + (0.5 - a) * (c01 - c00)
-                    slope1 = (0.5 + a) * (c12 - c11) + (0.5 - a) * (c11 - c10)
-                    slope2 = (0.5 + a) * (c22 - c21) + (0.5 - a) * (c21 - c20)
-                    fx = weight * scale * (b0 * slope0 + b1 * slope1 + b2 * slope2)
-                    sx += fx
-                    sy += fy
-                    s_theta += fy * rx - fx * ry
-                    s_radial += fx * rx + fy * ry
+            i0, j0 = int(max(u - eu, 0.0)), int(max(v - ev, 0.0))
+            i1, j1 = int(min(u + eu, num_cols - 1.0)), int(min(v + ev, num_rows - 1.0))
+            if max(i1 - i0, j1 - j0) >= half_of.shape[0]:
+                return
+            curvature = weight * _largest_curvature(
+                curvatures, at_curvatures, num_rows, num_cols, half_of, i0, j0, i1, j1
+            )
+            la += curvature
+            lx += curvature * rx
+            ly += curvature * ry
+            lc += curvature * (rx * rx + ry * ry)
+            u, v = px * scale + shift_x, py * scale + shift_y
+            if not (1.0 <= u < num_cols - 1 and 1.0 <= v < num_rows - 1):
+                continue
+            i, j = int(u), int(v)
+            a, b = u - 0.5 - i, v - 0.5 - j
+            a0, a1, a2 = 0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2
+            b0, b1, b2 = 0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2
+            at = at_coefficients + (j - 1) * num_cols + i - 1
+            c00, c01, c02 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
+            at += num_cols
+            c10, c11, c12 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
+            at += num_cols
+            c20, c21, c22 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
+            line0 = a0 * c00 + a1 * c01 + a2 * c02
+            line1 = a0 * c10 + a1 * c11 + a2 * c12
+            line2 = a0 * c20 + a1 * c21 + a2 * c22
+            s0 += weight * (b0 * line0 + b1 * line1 + b2 * line2)
+            fy = weight * scale * ((0.5 + b) * (line2 - line1) + (0.5 - b) * (line1 - line0))
+            slope0 = (0.5 + a) * (c02 - c01) + (0.5 - a) * (c01 - c00)
+            slope1 = (0.5 + a) * (c12 - c11) + (0.5 - a) * (c11 - c10)
+            slope2 = (0.5 + a) * (c22 - c21) + (0.5 - a) * (c21 - c20)
+            fx = weight * scale * (b0 * slope0 + b1 * slope1 + b2 * slope2)
+            sx += fx
+            sy += fy
+            s_theta += fy * rx - fx * ry
+            s_radial += fx * rx + fy * ry
         value += s0
         m33 += lc - s_radial
         all_a += la
         if is_inverse:
-            # d = -eps + (turn by -delta) z; vectors given in the rotated axes, back to those of t.
-            g_x += -(cos * sx - sin * sy)
-            g_y += -(sin * sx + cos * sy)
+            # The motion of t counts turned back; vectors in turned axes, then those of t.
+            g_x -= cos * sx - sin * sy
+            g_y -= sin * sx + cos * sy
             g_theta -= s_theta
             cross_x, cross_y = sy - ly, lx - sx
             b_x += cos * cross_x - sin * cross_y
@@ -149,11 +184,6 @@ def bound_box(points, terms, frames, levels, level_of, coefficients, bounds, cur
             b_y += lx
             e_x += lx
             e_y += ly
-    out[0] = total
-    out[1] = math.inf
-    out[2] = value if is_small else -math.inf
-    if not is_small:
-        return
     # f <= f0 + g d + 1/2 d^T M d over |d| <= h, the mixed terms split between the axes.
     q_x, q_y, q_theta = all_a, all_a, m33
     if swing > 0.0:
@@ -163,14 +193,12 @@ def bound_box(points, terms, frames, levels, level_of, coefficients, bounds, cur
         if h_y > 0.0:
             q_y += abs(b_y) * swing / h_y
             q_theta += abs(b_y) * h_y / swing
-    p_x = _parabola(abs(g_x), q_x, h_x)
-    p_y = _parabola(abs(g_y), q_y, h_y)
-    p_theta = _parabola(abs(g_theta), q_theta, swing)
+    out[2] = _parabola(abs(g_theta), q_theta, swing)
+    out[3] = _parabola(abs(g_x), q_x, h_x)
+    out[4] = _parabola(abs(g_y), q_y, h_y)
     rest = 0.5 * bow * bow * max(m33, 0.0) + bow * (abs(e_x) * h_x + abs(e_y) * h_y)
-    out[1] = value + p_x + p_y + p_theta + rest
-    out[3] = p_theta
-    out[4] = p_x
-    out[5] = p_y
+    out[0] = value + out[2] + out[3] + out[4] + rest
+    out[1] = value
 
 
 @njit(cache=True, nogil=True)
@@ -386,36 +414,30 @@ def _pop(keys, heap, count):
 
 
 @njit(cache=True, nogil=True)
+def _axis_to_split(child, arm, out):
+    """Axis whose half width leaves most to be gained: 0 theta, 1 x, 2 y."""
+    if out[0] < math.inf:
+        rise_theta, rise_x, rise_y = out[2], out[3], out[4]
+    else:
+        rise_theta, rise_x, rise_y = child[3] * arm, child[4], child[5]
+    if rise_theta >= rise_x and rise_theta >= rise_y:
+        return 0
+    return 1 if rise_x >= rise_y else 2
+
+
+@njit(cache=True, nogil=True)
 def run(
-    points,
-    terms,
-    frames,
-    levels,
-    level_of,
-    coefficients,
-    bounds,
-    curvatures,
-    window,
-    arm,
-    reach,
-    margin,
-    gap,
-    keep,
-    max_boxes,
-    boxes,
-    keys,
-    heap,
-    counters,
-    best,
-    found,
-):
+    points, terms, frames, levels, level_of, half_of, coefficients, bounds, curvatures, window,
+    arm, reach, margin, small, gap, keep, max_boxes, boxes, keys, heap, counters, best, found,
+):  # fmt: skip
     """Search until the gap is closed or `max_boxes` more boxes were bounded.
 
-    ``best``: lower bound, theta, x, y, largest bound of anything discarded. Boxes are discarded
-    whose bound is below ``keep`` times the lower bound. ``found`` (F, 4): local optima met, a ring
-    of value, theta, x, y.
+    ``best``: lower bound, theta, x, y, ratio to the best from which on a centre is climbed from,
+    largest bound of anything discarded. Boxes are discarded whose bound is below ``keep`` times
+    the lower bound. ``found`` (F, 4): local optima met, a ring of value, theta, x, y. ``small``:
+    reach [m] of a box up to which curvature is tried.
     """
-    out = np.zeros(6)
+    out = np.empty(5)
     child = np.zeros(6)
     pose = np.zeros(3)
     budget = counters[NUM_BOXES] + max_boxes
@@ -439,58 +461,40 @@ def run(
         centre = child[axis]
         for side in range(2):
             child[axis] = centre + (2 * side - 1) * child[axis + 3]
-            bound_box(
-                points,
-                terms,
-                frames,
-                levels,
-                level_of,
-                coefficients,
-                bounds,
-                curvatures,
-                child,
-                out,
-            )
+            upper = bound_first(points, terms, frames, levels, level_of, bounds, child) + margin
+            upper = min(parent_key, upper)
             counters[NUM_BOXES] += 1
-            upper = min(parent_key, min(out[0], out[1]) + margin)
-            is_close = out[2] > -math.inf
-            if is_close and out[2] > best[0]:
-                best[0] = out[2]
-                best[1:4] = child[:3]
-            if is_close and upper > best[0] and out[2] > best[4] * best[0]:
-                pose[:] = child[:3]
-                value = ascend(points, terms, frames, coefficients, window, arm, reach, pose, 30)
-                counters[NUM_ASCENTS] += 1
-                at = counters[NUM_FOUND] % found.shape[0]
-                found[at, 0] = value
-                found[at, 1:4] = pose
-                counters[NUM_FOUND] += 1
-                if value > best[0]:
-                    best[0] = value
-                    best[1:4] = pose
-                    best[4] = 0.3
-                else:
-                    # The more ascents fail, the nearer to the best a centre has to be for the
-                    # next.
-                    best[4] += 0.1 * (1.0 - best[4])
-            if upper <= best[0] and upper <= keep * best[0]:
+            out[0] = math.inf
+            floor = min(best[0], keep * best[0])
+            if upper > floor and child[3] * arm + max(child[4], child[5]) <= small:
+                bound_second(points, terms, frames, half_of, coefficients, curvatures, child, out)
+                counters[NUM_SECOND] += 1
+                upper = min(upper, out[0] + margin)
+                if out[1] > best[0]:
+                    best[0] = out[1]
+                    best[1:4] = child[:3]
+                if upper > best[0] and out[1] > best[4] * best[0]:
+                    pose[:] = child[:3]
+                    value = ascend(
+                        points, terms, frames, coefficients, window, arm, reach, pose, 30
+                    )
+                    at = counters[NUM_FOUND] % found.shape[0]
+                    found[at, 0] = value
+                    found[at, 1:4] = pose
+                    counters[NUM_FOUND] += 1
+                    if value > best[0]:
+                        best[0] = value
+                        best[1:4] = pose
+                        best[4] = 0.3
+                    else:
+                        # The more climbs fail, the better a centre has to be for the next.
+                        best[4] += 0.1 * (1.0 - best[4])
+            if upper <= floor:
                 best[5] = max(best[5], upper)
                 continue
             slot = heap[counters[NUM_OPEN]]
             boxes[slot, :6] = child
-            at_axis = 0
-            if out[1] <= out[0]:
-                if out[4] > out[3 + at_axis]:
-                    at_axis = 1
-                if out[5] > out[3 + at_axis]:
-                    at_axis = 2
-            else:
-                largest = child[3] * arm
-                if child[4] > largest:
-                    at_axis, largest = 1, child[4]
-                if child[5] > largest:
-                    at_axis = 2
-            boxes[slot, 6] = at_axis
+            boxes[slot, 6] = _axis_to_split(child, arm, out)
             keys[slot] = upper
             _push(keys, heap, counters[NUM_OPEN], slot)
             counters[NUM_OPEN] += 1

@@ -24,6 +24,7 @@ from uw_dslam_ros2.core.registration.branch_and_bound import (
     Status,
     Term,
     as_points,
+    objective_at,
     search,
 )
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
@@ -51,8 +52,10 @@ __all__ = ["register_point_sets"]
 FloatArray = NDArray[np.float64]
 
 _LADDER = (0.75, 0.3, 0.1)  # kernels, in mean spacings of the target points
-_PAPER_SIGMA = 0.1  # the paper's sigma, for its points within [-1, 1]^2
+_LATER_BOXES = 100_000  # a narrower kernel only has to offer candidates, not a proof
 _MAX_CANDIDATES = 48
+_TWIN = 0.7  # a pose that explains the points as well as a decisive one scores at least this much
+_USUAL_SIGMA = 0.25  # noise that is nothing special, in mean spacings of the target points
 _DECISIVE = 1e-6  # probability of chance below which narrower kernels need not be tried
 
 
@@ -70,6 +73,7 @@ class _Cloud:
 class _Rung:
     """One search and the refined poses it led to, best evidence first."""
 
+    terms: list[Term]
     outcome: SearchOutcome
     unit: float  # what a perfect match of all source weight scores
     error: float  # between the field and its formula, for all source weight
@@ -152,6 +156,7 @@ class _Match:
             self._source.weights, self._target.weights,
         )  # fmt: skip
         self._volume = self._searched_volume(points)
+        self._usual_m = _USUAL_SIGMA * self._spacing_m
 
     def _centred_prior(self, prior: PriorWindow | None) -> PriorWindow | None:
         if prior is None:
@@ -173,19 +178,18 @@ class _Match:
     def result(self, start: float) -> RegistrationResult:
         """Search, refine, decide."""
         rungs = self._likelihood() if self._config.method == "likelihood" else self._gmrbnb()
-        rung = max(rungs, key=lambda r: r.candidates[0][0])
         hypotheses = self._merged(rungs)
-        return self._packed(rung, hypotheses, sum(r.outcome.num_boxes for r in rungs), start)
+        return self._packed(rungs[0], hypotheses, sum(r.outcome.num_boxes for r in rungs), start)
 
     def _likelihood(self) -> list[_Rung]:
         """Rungs of the ladder, until one is decisive."""
         rungs: list[_Rung] = []
         for sigma_m in self._ladder():
-            rungs.append(self._rung(sigma_m))
+            limit = _LATER_BOXES if rungs else self._config.max_boxes
+            rungs.append(self._rung(sigma_m, limit))
             if rungs[-1].outcome.status in (Status.TIME, Status.CANCELLED):
                 break
-            evidence = max(r.candidates[0][0] for r in rungs)
-            if posterior([evidence]) > 1.0 - _DECISIVE:
+            if self._is_decisive([r.candidates[0] for r in rungs]):
                 break
         return rungs
 
@@ -196,14 +200,15 @@ class _Match:
             return (math.sqrt(2.0) * self._config.sigma_m,)
         return tuple(step * self._spacing_m for step in _LADDER)
 
-    def _settings(self) -> SearchSettings:
+    def _settings(self, max_boxes: int) -> SearchSettings:
         config = self._config
+        max_boxes = min(max_boxes, config.max_boxes)
         left = math.inf
         if config.max_seconds > 0.0 and self._clock:
             left = max(config.max_seconds - (self._clock() - self._start), 0.0)
-        return SearchSettings(config.gap, config.max_boxes, left, config.max_memory_mb)
+        return SearchSettings(config.gap, max_boxes, left, config.max_memory_mb)
 
-    def _rung(self, sigma_m: float | None) -> _Rung:
+    def _rung(self, sigma_m: float | None, max_boxes: int) -> _Rung:
         """Search with one kernel (None: each point its own) and refine what was met."""
         share = 1.0 - self._config.clutter_share
         n = len(self._target.points)
@@ -217,9 +222,9 @@ class _Match:
             )  # fmt: skip
             terms.append(Term(points, weights * math.log1p(contrast), field))
         unit = sum(float(term.weights.sum()) for term in terms)
-        outcome = self._search(terms, "search")
+        outcome = self._search(terms, "search", max_boxes)
         start = sigma_m if sigma_m is not None else width
-        return _Rung(outcome, unit, 0.0, self._refined(outcome, start))
+        return _Rung(terms, outcome, unit, 0.0, self._refined(outcome, start))
 
     def _classes(self, sigma_m: float | None) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         """Source points of equal standard deviation, with that of their pairs (n,)."""
@@ -240,25 +245,36 @@ class _Match:
     def _max_nodes(self) -> int:
         return max(10_000, int(self._config.max_memory_mb * 1e6 / 2.0 / 40.0))
 
-    def _search(self, terms: list[Term], stage: str) -> SearchOutcome:
+    def _search(self, terms: list[Term], stage: str, max_boxes: int) -> SearchOutcome:
         return search(
-            terms, self._settings(), prior=self._prior, clock=self._clock,
+            terms, self._settings(max_boxes), prior=self._prior, clock=self._clock,
             progress=self._progress, is_cancelled=self._is_cancelled, stage=stage,
         )  # fmt: skip
 
     def _refined(self, outcome: SearchOutcome, sigma_m: float) -> list[tuple[float, Refinement]]:
         """Refined optima with their evidence, best first, each pose once."""
         found: list[tuple[float, Refinement]] = []
-        for _, x, y, theta in outcome.optima[:_MAX_CANDIDATES]:
-            refinement = refine(self._model, np.array([theta, x, y]), sigma_m, self._volume)
+        for value, x, y, theta in outcome.optima[:_MAX_CANDIDATES]:
+            if value < _TWIN * outcome.optima[0, 0] and found and self._is_decisive(found):
+                break
+            refinement = refine(
+                self._model, np.array([theta, x, y]), sigma_m, self._volume, self._usual_m
+            )
             if self._is_outside(refinement.pose()):
                 continue
-            found.append((pose_evidence(refinement, self._volume), refinement))
+            found.append((self._evidence(refinement), refinement))
         if not found:
             pose = outcome.T_target_source
             refinement = evaluate_pose(self._model, pose, sigma_m)
-            found = [(pose_evidence(refinement, self._volume), refinement)]
+            found = [(self._evidence(refinement), refinement)]
         return self._distinct(found)
+
+    @staticmethod
+    def _is_decisive(found: list[tuple[float, Refinement]]) -> bool:
+        return posterior([max(evidence for evidence, _ in found)]) > 1.0 - _DECISIVE
+
+    def _evidence(self, refinement: Refinement) -> float:
+        return pose_evidence(refinement, self._volume, self._usual_m)
 
     def _is_outside(self, pose: SE2) -> bool:
         if self._prior is None:
@@ -322,9 +338,9 @@ class _Match:
             terms.append(Term(points[chosen], weights[chosen], field))
             error += float(weights[chosen].sum()) * field.error
         unit = sum(float(term.weights.sum()) for term in terms) * float(target.weights.max())
-        outcome = self._search(terms, stage)
+        outcome = self._search(terms, stage, self._config.max_boxes)
         width = sigma_m if sigma_m is not None else float(np.sqrt(np.mean(sigmas_m**2)))
-        return _Rung(outcome, unit, error, self._refined(outcome, width))
+        return _Rung(terms, outcome, unit, error, self._refined(outcome, width))
 
     def _packed(
         self,
@@ -358,7 +374,7 @@ class _Match:
             T_target_source=pose,
             covariance=self._full_covariance(best, pose),
             probability=probability,
-            score=lower,
+            score=min(objective_at(rung.terms, best.pose()) / rung.unit, upper),
             lower_bound=lower,
             upper_bound=upper,
             is_certified=outcome.status is Status.CERTIFIED,
@@ -454,11 +470,16 @@ def _area(points: FloatArray) -> float:
 
 def _covariance(refinement: Refinement) -> FloatArray:
     """Inverse information (3, 3) of theta, x, y; inf where it is singular."""
+    if not refinement.information.any():
+        return np.full((3, 3), math.inf)
     scale = np.sqrt(np.maximum(np.diag(refinement.information), 1e-300))
     normed = refinement.information / np.outer(scale, scale)
     if np.linalg.eigvalsh(normed)[0] < 1e-9:
         return np.full((3, 3), math.inf)
-    return np.linalg.inv(normed) / np.outer(scale, scale)
+    # The pose took three of the pairs' degrees of freedom from the estimate of the noise.
+    num_numbers = 2.0 * max(refinement.num_pairs, 3.0)
+    inflation = num_numbers / (num_numbers - 3.0)
+    return inflation * np.linalg.inv(normed) / np.outer(scale, scale)
 
 
 def _has_partner(

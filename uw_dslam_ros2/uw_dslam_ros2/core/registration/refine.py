@@ -52,7 +52,8 @@ class PointModel:
         weights_m = ones_m if source_weights is None else source_weights / source_weights.mean()
         weights_n = ones_n if target_weights is None else target_weights / target_weights.mean()
         return cls(
-            np.ascontiguousarray(source), weights_m, np.ascontiguousarray(target[order]), weights_n[order],
+            np.ascontiguousarray(source), weights_m,
+            np.ascontiguousarray(target[order]), weights_n[order],
             area_m2, min_sigma_m, max_sigma_m,
         )  # fmt: skip
 
@@ -64,6 +65,7 @@ class Refinement:
     parameters: FloatArray  # (3,): theta, x, y
     sigma_m: float  # estimated standard deviation of a pair along one axis
     share: float  # estimated share of source points with a partner
+    num_pairs: float  # the same, counted
     log_likelihood: float  # ratio to "everything is clutter", in nats
     information: FloatArray  # (3, 3), of theta, x, y
 
@@ -78,6 +80,7 @@ def refine(
     parameters: FloatArray,
     sigma_m: float,
     volume: float,
+    usual_sigma_m: float,
     share: float = 0.5,
     num_halvings: int = 5,
 ) -> Refinement:
@@ -88,7 +91,7 @@ def refine(
     highest evidence, in the searched `volume`, wins.
     """
     best = _climb(model, parameters, sigma_m, model.max_sigma_m, share, 60)
-    best_evidence = pose_evidence(best, volume)
+    best_evidence = pose_evidence(best, volume, usual_sigma_m)
     last = best
     for halving in range(1, num_halvings + 1):
         cap = sigma_m * 0.5**halving
@@ -97,7 +100,7 @@ def refine(
         if cap <= model.min_sigma_m:
             break
         last = _climb(model, last.parameters, cap, cap, last.share, 30)
-        evidence = pose_evidence(last, volume)
+        evidence = pose_evidence(last, volume, usual_sigma_m)
         if evidence > best_evidence:
             best, best_evidence = last, evidence
     return best
@@ -117,7 +120,14 @@ def _climb(
         model.source, model.source_weights, model.target, model.target_weights,
         model.area_m2, model.min_sigma_m, max_sigma_m, state, max_steps, information,
     )  # fmt: skip
-    return Refinement(state[:3], float(state[3]), float(state[4]), float(value), information)
+    return Refinement(
+        state[:3],
+        float(state[3]),
+        float(state[4]),
+        float(state[4]) * len(model.source),
+        float(value),
+        information,
+    )
 
 
 def evaluate_pose(model: PointModel, pose: SE2, sigma_m: float, share: float = 0.5) -> Refinement:
@@ -125,18 +135,20 @@ def evaluate_pose(model: PointModel, pose: SE2, sigma_m: float, share: float = 0
     return _climb(model, pose.as_array()[[2, 0, 1]], sigma_m, model.max_sigma_m, share, 0)
 
 
-def pose_evidence(refinement: Refinement, volume: float) -> float:
+def pose_evidence(refinement: Refinement, volume: float, usual_sigma_m: float) -> float:
     """Log of the Bayes factor of "there is a common pose" against chance, by Laplace's method.
 
     The likelihood ratio, times the volume (theta, x, y) that the posterior fills, over the volume
-    searched. Under chance it exceeds x with a probability of about exp(-x), whatever the number of
-    points and the kernel.
+    searched. Noise much below `usual_sigma_m` has to be proven too, for a few points always agree
+    very well somewhere: its prior falls with the third power. Under chance the result exceeds x
+    with a probability of about exp(-x), whatever the number of points and the kernel.
     """
-    sign, log_det = np.linalg.slogdet(refinement.information)
-    if sign <= 0.0:
+    eigenvalues = np.linalg.eigvalsh(refinement.information)
+    if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
         return -math.inf
-    log_width = 1.5 * math.log(2.0 * math.pi) - 0.5 * float(log_det)
-    return refinement.log_likelihood + min(log_width - math.log(volume), 0.0)
+    log_width = 1.5 * math.log(2.0 * math.pi) - 0.5 * float(np.log(eigenvalues).sum())
+    log_prior = min(3.0 * math.log(refinement.sigma_m / usual_sigma_m), 0.0)
+    return refinement.log_likelihood + min(log_width - math.log(volume), 0.0) + log_prior
 
 
 def procrustes(source: FloatArray, target: FloatArray, weights: FloatArray) -> SE2:

@@ -113,16 +113,51 @@ def expectation_maximisation(
         value = _expect(source, source_weights, target, target_weights, area, state, partner)
         if moved < 1e-7:
             break
-    # Curvature of pairs that keep their partners; what clutter may contribute is no information.
-    information[:, :] = 0.0
-    cos, sin = math.cos(state[0]), math.sin(state[0])
-    for i in range(m):
-        w = partner[i, 0] / (state[3] * state[3])
-        rx, ry = cos * source[i, 0] - sin * source[i, 1], sin * source[i, 0] + cos * source[i, 1]
-        information[0, 0] += w * (rx * rx + ry * ry)
-        information[0, 1] -= w * ry
-        information[0, 2] += w * rx
-        information[1, 1] += w
-        information[2, 2] += w
-    information[1, 0], information[2, 0] = information[0, 1], information[0, 2]
+    _observe(source, source_weights, target, target_weights, area, state, information)
     return value
+
+
+@njit(cache=True, nogil=True)
+def _observe(source, source_weights, target, target_weights, area, state, information):
+    """Negative second derivatives of the likelihood in theta, x, y; partners are not certain."""
+    theta, tx, ty, sigma, share = state[0], state[1], state[2], state[3], state[4]
+    cos, sin = math.cos(theta), math.sin(theta)
+    cut = 5.0 * sigma
+    density = share * area / (target.shape[0] * 2.0 * math.pi * sigma * sigma)
+    scale = 1.0 / (sigma * sigma)
+    information[:, :] = 0.0
+    for i in range(source.shape[0]):
+        rx = cos * source[i, 0] - sin * source[i, 1]
+        ry = sin * source[i, 0] + cos * source[i, 1]
+        px, py = rx + tx, ry + ty
+        total, mean_x, mean_y, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(_first_at_least(target, px - cut), target.shape[0]):
+            dx = target[j, 0] - px
+            if dx > cut:
+                break
+            dy = target[j, 1] - py
+            if dy > cut or dy < -cut:
+                continue
+            weight = target_weights[j] * math.exp(-0.5 * scale * (dx * dx + dy * dy))
+            total += weight
+            mean_x += weight * dx
+            mean_y += weight * dy
+            xx += weight * dx * dx
+            xy += weight * dx * dy
+            yy += weight * dy * dy
+        part = density / (1.0 - share + density * total) * scale
+        gx, gy = part * mean_x, part * mean_y
+        w = source_weights[i]
+        hxx = -w * (part * (xx * scale - total) - gx * gx)
+        hyy = -w * (part * (yy * scale - total) - gy * gy)
+        hxy = -w * (part * xy * scale - gx * gy)
+        information[0, 0] += (
+            ry * ry * hxx - 2.0 * rx * ry * hxy + rx * rx * hyy + w * (gx * rx + gy * ry)
+        )
+        information[0, 1] += -ry * hxx + rx * hxy
+        information[0, 2] += -ry * hxy + rx * hyy
+        information[1, 1] += hxx
+        information[1, 2] += hxy
+        information[2, 2] += hyy
+    information[1, 0], information[2, 0] = information[0, 1], information[0, 2]
+    information[2, 1] = information[1, 2]
