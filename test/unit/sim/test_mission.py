@@ -22,7 +22,7 @@ from uw_dslam_ros2.sim.mission import (
 from uw_dslam_ros2.sim.raster import grid_over, seen_map
 from uw_dslam_ros2.sim.recording import read_mission, simulate_mission
 
-SHORT = replace(tiny_mission_config(), duration_s=4.0)
+SHORT = replace(tiny_mission_config(), duration_s=4.0, truth_resolution_m=0.5)
 
 
 def default_config(seed):

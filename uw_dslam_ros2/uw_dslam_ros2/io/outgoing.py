@@ -33,6 +33,8 @@ class MessageFactory:
 
     def __init__(self, typestore: Typestore) -> None:
         self._types = typestore.types
+        # A sonar's beams are the same ping after ping.
+        self._beams: tuple[bytes, list[Any]] = (b"", [])
 
     def make(self, msgtype: str, **fields: Any) -> Any:
         """Build a message; every field of the type must be given."""
@@ -86,10 +88,7 @@ class MessageFactory:
                 tx_beamwidths=np.empty(0, np.float32),
                 rx_beamwidths=widths,
             ),
-            # z forward, y to starboard: port bearings have negative y.
-            beam_directions=[
-                self.vector(0.0, -math.sin(b), math.cos(b)) for b in image.bearing_rad
-            ],
+            beam_directions=self._directions(image.bearing_rad),
             ranges=image.range_m.astype(np.float32),
             image=self.make(
                 "marine_acoustic_msgs/msg/SonarImageData",
@@ -99,6 +98,14 @@ class MessageFactory:
                 data=data.view(np.uint8).reshape(-1),
             ),
         )
+
+    def _directions(self, bearing_rad: FloatArray) -> list[Any]:
+        """Unit vectors, z forward and y to starboard: bearings to port have negative y."""
+        key = bearing_rad.tobytes()
+        if key != self._beams[0]:
+            vectors = [self.vector(0.0, -math.sin(b), math.cos(b)) for b in bearing_rad.tolist()]
+            self._beams = (key, vectors)
+        return self._beams[1]
 
     def imu(
         self,

@@ -21,6 +21,8 @@ FloatArray = NDArray[np.float64]
 
 _CELL_M = 0.5
 _STEP_M = 0.25
+_SMOOTHING_M = 1.0
+_NUM_SMOOTHINGS = 16  # together as one of 4 m
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,7 @@ def plan_survey(
         If the area has no water that can be reached with the clearance.
     """
     spec, clearance = _clearance_map(world)
-    is_free = _reachable(world, spec, clearance >= clearance_m)
+    is_free = _reachable(clearance >= clearance_m)
     rows, cols = np.nonzero(is_free)
     centers = spec.centers_of(np.column_stack([rows, cols]))
     inside = (
@@ -94,13 +96,10 @@ def _clearance_map(world: World) -> tuple[GridSpec, FloatArray]:
     return spec, distance_transform_edt(~wall_mask(world, spec)) * _CELL_M
 
 
-def _reachable(world: World, spec: GridSpec, is_clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The connected part of the clear cells next to the place's water point."""
+def _reachable(is_clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The largest connected part of the clear cells; pockets of land and water are smaller."""
     parts, _ = label(is_clear)
-    cells = np.argwhere(is_clear)
-    start = spec.cells_of(np.array([world.water_point]))[0]
-    nearest = cells[np.argmin(((cells - start) ** 2).sum(axis=1))]
-    return parts == parts[tuple(nearest)]
+    return parts == 1 + np.argmax(np.bincount(parts[is_clear])[1:])
 
 
 def _waypoints(area: SurveyArea, rng: np.random.Generator) -> FloatArray:
@@ -132,14 +131,24 @@ def _waypoints(area: SurveyArea, rng: np.random.Generator) -> FloatArray:
 def _smoothed(
     route: FloatArray, spec: GridSpec, clearance: FloatArray, min_clearance_m: float
 ) -> FloatArray:
-    """Resample evenly and round the corners, as much as the clearance allows."""
+    """Resample evenly and round the corners, everywhere as much as the clearance allows."""
     route = _resampled(route, _STEP_M)
-    for sigma_m in (4.0, 3.0, 2.0, 1.5, 1.0, 0.5):
-        smooth = gaussian_filter1d(route, sigma_m / _STEP_M, axis=0, mode="nearest")
-        cells = np.clip(spec.cells_of(smooth), 0, np.array(spec.shape) - 1)
-        if clearance[cells[:, 0], cells[:, 1]].min() >= min_clearance_m:
-            return _resampled(smooth, _STEP_M)
-    return route
+
+    def clearance_of(points: FloatArray) -> FloatArray:
+        cells = np.clip(spec.cells_of(points), 0, np.array(spec.shape) - 1)
+        return clearance[cells[:, 0], cells[:, 1]]
+
+    here = clearance_of(route)
+    for _ in range(_NUM_SMOOTHINGS):
+        moved = gaussian_filter1d(route, _SMOOTHING_M / _STEP_M, axis=0, mode="nearest")
+        there = clearance_of(moved)
+        # A point gives way only to where it is clear enough, or clearer than it was; nearly so
+        # do its neighbours, lest the route get a kink.
+        is_allowed = (there >= min_clearance_m) | (there >= here)
+        share = gaussian_filter1d(is_allowed.astype(np.float64), 1.0 / _STEP_M, mode="nearest")
+        route = route + (is_allowed * share)[:, None] * (moved - route)
+        here = clearance_of(route)
+    return _resampled(route, _STEP_M)
 
 
 def _resampled(route: FloatArray, step_m: float) -> FloatArray:
