@@ -23,10 +23,12 @@ IntArray = NDArray[np.int64]
 TableArray = NDArray[np.int16]
 
 TABLE_STEP = 1.0 / 16000.0
-"""Tables hold bounds rounded up to whole multiples of this."""
+"""Tables of values hold bounds rounded up to whole multiples of this."""
+CURVATURE_STEP = 1.0 / 2000.0
+"""The same for tables of curvatures, which reach 12 for the harshest fields."""
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _value_gradient(coefficients: FloatGrid, x: float, y: float) -> tuple[float, float, float]:
     """Field and its gradient [1 / cell] at (x, y), padded coordinates; 0 outside."""
     num_rows, num_cols = coefficients.shape
@@ -208,7 +210,7 @@ def _smooth_bound(
         radius = math.sqrt(px * px + py * py)
         reach = reach_t + radius * half_rad
         x, y = px + t_x + pad, py + t_y + pad
-        curvature = TABLE_STEP * _region_max(
+        curvature = CURVATURE_STEP * _region_max(
             target_curvature, layer_of_width, width_of_layer,
             x + 0.5 - reach, x + 0.5 + reach, y + 0.5 - reach, y + 0.5 + reach,
         )  # fmt: skip
@@ -226,7 +228,7 @@ def _smooth_bound(
         radius = math.sqrt(qx * qx + qy * qy)
         reach = reach_t + radius * half_rad
         x, y = qx + center[0] + pad, qy + center[1] + pad
-        curvature = TABLE_STEP * _region_max(
+        curvature = CURVATURE_STEP * _region_max(
             source_curvature, layer_of_width, width_of_layer,
             x + 0.5 - reach, x + 0.5 + reach, y + 0.5 - reach, y + 0.5 + reach,
         )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence
-from uw_dslam_ros2.core.registration.grid_kernels import TABLE_STEP
+from uw_dslam_ros2.core.registration.grid_kernels import CURVATURE_STEP, TABLE_STEP
 
 __all__ = [
     "PAD",
@@ -84,15 +84,15 @@ def value_tables(field: SignedField) -> TableArray:
     and likewise for columns. Within a cell the spline is a polynomial inside the hull of its nine
     Bezier coefficients.
     """
-    return _windows(_bezier_max(field.coefficients))
+    return _windows(_bezier_max(field.coefficients), TABLE_STEP)
 
 
 def curvature_tables(field: SignedField) -> TableArray:
-    """Upper bounds of the field's greatest curvature [1 / cell^2], otherwise as `value_tables`.
+    """Upper bounds of the field's curvature [1 / cell^2], in `CURVATURE_STEP`; see `value_tables`.
 
     Second derivatives are inside the hull of the coefficients' second differences.
     """
-    return _windows(_curvature_max(field.coefficients))
+    return _windows(_curvature_max(field.coefficients), CURVATURE_STEP)
 
 
 def refined(field: SignedField) -> SignedField:
@@ -111,9 +111,9 @@ def refined(field: SignedField) -> SignedField:
     return SignedField(c)
 
 
-def _windows(base: FloatGrid) -> TableArray:
+def _windows(base: FloatGrid, step: float) -> TableArray:
     # The margin covers that kernels compute in double precision from single-precision numbers.
-    steps = np.ceil((base + np.float32(2e-6)) / np.float32(TABLE_STEP)).astype(np.int16)
+    steps = np.ceil((base + np.float32(2e-6)) / np.float32(step)).astype(np.int16)
     tables = np.empty((len(WIDTHS), *base.shape), np.int16)
     for layer, width in enumerate(WIDTHS):
         tables[layer] = cv2.dilate(steps, np.ones((width, width), np.uint8), anchor=(0, 0))
@@ -147,4 +147,4 @@ def _curvature_max(c: FloatGrid) -> FloatGrid:
     xy = np.maximum(
         np.maximum(cross[:-1, :-1], cross[:-1, 1:]), np.maximum(cross[1:, :-1], cross[1:, 1:])
     )
-    return np.clip(np.maximum(xx, yy) + xy, np.float32(0.0), np.float32(2.0))
+    return np.maximum(np.maximum(xx, yy) + xy, np.float32(0.0))
