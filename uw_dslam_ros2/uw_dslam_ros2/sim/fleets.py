@@ -145,7 +145,7 @@ def make_result(
         reason="" if verdict is Verdict.ACCEPTED else verdict.name.lower().replace("_", " "),
         T_target_source=T_target_source,
         covariance=np.diag([sigma_m**2, sigma_m**2, sigma_rad**2]),
-        probability=0.99,
+        probability=0.99 if verdict is Verdict.ACCEPTED else 0.05,
         score=0.8,
         lower_bound=0.8,
         upper_bound=0.8,

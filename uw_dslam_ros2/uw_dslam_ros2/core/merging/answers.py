@@ -49,9 +49,16 @@ class Answer:
     @property
     def is_accepted(self) -> bool:
         """Accepted, and where a window was asked for, inside it."""
-        if self.verdict is not Verdict.ACCEPTED:
-            return False
-        prior = self.match.prior
+        return self.verdict is Verdict.ACCEPTED and self.is_inside(self.match.prior)
+
+    @property
+    def is_guess(self) -> bool:
+        """Whether the transform means anything: accepted, or merely not sure enough."""
+        is_unsure = self.verdict in (Verdict.ACCEPTED, Verdict.NOT_ENOUGH_OVERLAP)
+        return is_unsure and self.is_inside(self.match.prior)
+
+    def is_inside(self, prior: PriorWindow | None) -> bool:
+        """Whether the transform lies in a window, or there is none."""
         if prior is None:
             return True
         guess, found = prior.T_target_source, self.T_target_source

@@ -43,6 +43,12 @@ class MapQueueConfig(Config):
     max_part_searches: int = setting(
         4, 1, 1000, "searches between two components by their most promising parts"
     )
+    vague_cells: float = setting(
+        2.0, 0.1, 1e6, "places that saw the same are matched if less sure of each other [cells]"
+    )
+    vague_share: float = setting(
+        1.0, 0.0, 100.0, "at most so many such matches for each submap, on average"
+    )
     inlier_probability: float = setting(
         0.99, 0.5, 0.999999, "share of right edges that the chi-square test of an edge keeps"
     )

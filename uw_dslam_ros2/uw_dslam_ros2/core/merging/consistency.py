@@ -23,7 +23,7 @@ from uw_dslam_ros2.core.merging.graph import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["Side", "consistent_set", "cycle_distance"]
+__all__ = ["Side", "consistent_set", "cycle_distance", "cycle_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -45,8 +45,8 @@ class Side:
         return self.T_frame_submap[target].inverse() @ self.T_frame_submap[source]
 
 
-def cycle_distance(first: Edge, second: Edge, source: Side, target: Side) -> float:
-    """Squared Mahalanobis distance by which two edges from `source` to `target` fail to close."""
+def cycle_of(first: Edge, second: Edge, source: Side, target: Side) -> tuple[SE2, FloatArray]:
+    """By how much two edges from `source` to `target` fail to close, and covariance (3, 3)."""
     forth, back = first.T_target_source, second.T_target_source.inverse()
     motions = [
         forth,
@@ -68,8 +68,12 @@ def cycle_distance(first: Edge, second: Edge, source: Side, target: Side) -> flo
         for motion in motions[index + 1 :]:
             right = right @ motion
         total += compose_covariance(covariance, left, motions[index], right)
-    closed = motions[0] @ motions[1] @ motions[2] @ motions[3]
-    return mahalanobis(closed, total)
+    return motions[0] @ motions[1] @ motions[2] @ motions[3], total
+
+
+def cycle_distance(first: Edge, second: Edge, source: Side, target: Side) -> float:
+    """Squared Mahalanobis distance by which two edges fail to close; see `cycle_of`."""
+    return mahalanobis(*cycle_of(first, second, source, target))
 
 
 def consistent_set(
@@ -86,7 +90,7 @@ def consistent_set(
     edges
         All from `source` to `target`.
     weights
-        What each is worth, in (0, 1]; more edges beat heavier ones.
+        What each is worth, in [0, 1], such as the probability that it is right.
     source, target
         The two maps.
     inlier_probability
@@ -97,7 +101,7 @@ def consistent_set(
     # A clique finder takes exponential time in the worst case.
     order = sorted(range(len(edges)), key=lambda i: (-weights[i], i))[:_MAX_CLIQUE_EDGES]
     for i in sorted(order):
-        graph.add_node(i, weight=1000 + round(100 * weights[i]))
+        graph.add_node(i, weight=1 + round(1000 * weights[i]))
     for i in graph:
         for j in graph:
             if i < j and cycle_distance(edges[i], edges[j], source, target) <= threshold:

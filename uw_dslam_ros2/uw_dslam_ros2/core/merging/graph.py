@@ -39,6 +39,12 @@ class Edge:
     T_target_source: SE2
     covariance: FloatArray
 
+    def reversed(self) -> Edge:
+        """The same from the other side."""
+        motion = self.T_target_source
+        covariance = invert_covariance(self.covariance, motion)
+        return Edge(self.target, self.source, motion.inverse(), covariance)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:

@@ -14,6 +14,8 @@ Its steps:
    meet.
 4. Components that are still apart are matched as wholes, and by their most promising parts; what
    is accepted there is checked likewise. This goes on as long as something joins.
+5. Where the graph is still vague although two places have seen the same, of one vehicle or of two,
+   they are matched near where the graph puts them.
 """
 
 from __future__ import annotations
@@ -106,6 +108,8 @@ class _Planner:
             if not more:
                 break
             joints += more
+        if not self._is_waiting():
+            joints += self._tighten(joints)
         return self._finish(joints)
 
     def _is_waiting(self) -> bool:
@@ -184,6 +188,16 @@ class _Planner:
             taken[ends] = taken.get(ends, 0) + 1
             if taken[ends] <= self._config.max_part_searches:
                 found += self._verifier.joints_of(match, source_side, target_side)
+        return found
+
+    def _tighten(self, joints: Sequence[Joint]) -> list[Joint]:
+        """Step 5."""
+        settled, components = self._settle(joints)
+        inliers = [joint for joint in settled if joint.is_inlier]
+        found: list[Joint] = []
+        for component in components:
+            side = self._library.component_side(component)
+            found += self._verifier.joints_where_vague(side, inliers)
         return found
 
     def _between(
