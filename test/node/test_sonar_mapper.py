@@ -241,9 +241,7 @@ def test_wrong_type_on_a_topic_is_told(ros_context, ros_domain_id, spinning):
     driver.create_publisher(TwistWithCovarianceStamped, "/auv_1/dvl", 10)
     probe, heard = rclpy.create_node("probe", context=ros_context), []
     probe.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
-    words = (
-        "topic /auv_1/dvl has type geometry_msgs/msg/TwistWithCovarianceStamped, expected"
-    )
+    words = "topic /auv_1/dvl has type geometry_msgs/msg/TwistWithCovarianceStamped, expected"
     with spinning(mapper, probe) as until:
         until(lambda: heard and words in heard[-1].status[0].message, "the complaint")
     driver.destroy_node()

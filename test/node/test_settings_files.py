@@ -1,0 +1,95 @@
+"""Files in config/ serve the nodes they are for; the documentation lists every parameter."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+
+from uw_dslam_ros2.core.errors import ConfigError
+from uw_dslam_ros2.ros.map_queue_manager import MapQueueManager
+from uw_dslam_ros2.ros.parameter_table import parameter_tables, with_tables
+from uw_dslam_ros2.ros.registration_server import RegistrationServer
+from uw_dslam_ros2.ros.sonar_mapper import SonarMapper
+
+pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).parents[2]
+FILES = sorted((ROOT / "config").glob("*.yaml"))
+NODES = {
+    "sonar_mapper": SonarMapper,
+    "registration_server": RegistrationServer,
+    "map_queue_manager": MapQueueManager,
+}
+
+
+@pytest.fixture
+def start(ros_domain_id):
+    """Start a node with a settings file, as the command line does."""
+    made = []
+
+    def run(name, path):
+        context = rclpy.Context()
+        arguments = ["--ros-args", "--params-file", str(path), "-r", "__ns:=/auv_1"]
+        rclpy.init(args=arguments, context=context, domain_id=ros_domain_id)
+        made.append(context)
+        node = NODES[name](context=context)
+        made.append(node)
+        return node
+
+    yield run
+    for thing in reversed(made):
+        thing.try_shutdown() if isinstance(thing, rclpy.Context) else thing.destroy_node()
+
+
+@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_file_serves_every_node(start, name, path):
+    """One file may be given to all nodes of a graph."""
+    assert start(name, path).get_name() == name
+
+
+def test_there_is_a_file_for_every_node():
+    assert set(NODES) <= {path.stem for path in FILES}
+
+
+def test_value_of_a_file_reaches_the_node(start, tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text(
+        "/**:\n  ros__parameters:\n    input: points\n"
+        "    mapper: {occupancy: {resolution_m: 0.25}}\n    queue: {mode: pairwise}\n"
+    )
+    node = start("sonar_mapper", path)
+    assert node.get_parameter("mapper.occupancy.resolution_m").value == 0.25
+    assert node.get_parameter("input").value == "points"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("mapper: {occupancy: {resolution: 0.1}}", "mapper.occupancy.resolution is unknown"),
+        ("mapper: {occupancy: {resolution_m: 1}}", "write 1.0"),
+        ("mapper: {occupancy: {resolution_m: -1.0}}", "resolution_m is -1.0, expected 0.01 to"),
+        ("inputt: points", "inputt is unknown to sonar_mapper; did you mean input"),
+    ],
+)
+def test_typing_error_in_a_file_is_refused(start, tmp_path, text, words):
+    path = tmp_path / "settings.yaml"
+    path.write_text(f"/**:\n  ros__parameters:\n    {text}\n")
+    with pytest.raises(ConfigError, match=words):
+        start("sonar_mapper", path)
+
+
+def test_documented_parameters_are_those_of_the_settings():
+    """`./uw python -m uw_dslam_ros2.ros.parameter_table docs/interfaces.md` renews the tables."""
+    page = (ROOT / "docs" / "interfaces.md").read_text()
+    assert with_tables(page) == page
+
+
+def test_every_parameter_has_its_text():
+    lines = [line for line in parameter_tables().splitlines() if line.startswith("| `")]
+    assert len(lines) > 50
+    assert [line for line in lines if line.rstrip(" |").endswith("|")] == []
+    assert [line for line in lines if not line.split("|")[5].strip()] == []

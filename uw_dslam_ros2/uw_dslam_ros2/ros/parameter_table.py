@@ -1,0 +1,96 @@
+"""Writes the tables of parameters into docs/interfaces.md, from the settings themselves.
+
+::
+
+    ./uw python -m uw_dslam_ros2.ros.parameter_table docs/interfaces.md
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from uw_dslam_ros2.core.config import Config
+from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.mapping import VehicleMapperConfig
+from uw_dslam_ros2.core.merging import MapQueueConfig
+from uw_dslam_ros2.core.registration import GridRegistrationConfig, RegistrationConfig
+from uw_dslam_ros2.ros.node_settings import NODE_CONFIGS
+from uw_dslam_ros2.ros.parameters import parameter_type, settings_of
+
+__all__ = ["GROUPS", "parameter_tables", "with_tables"]
+
+GROUPS: dict[str, tuple[tuple[str, type[Config]], ...]] = {
+    "sonar_mapper": (("mapper", VehicleMapperConfig),),
+    "registration_server": (
+        ("registration", GridRegistrationConfig),
+        ("points", RegistrationConfig),
+    ),
+    "map_queue_manager": (("queue", MapQueueConfig),),
+    "bag_player": (),
+}
+"""Groups of parameters of each node, beside its own."""
+
+_BEGIN = "<!-- parameters: written by uw_dslam_ros2.ros.parameter_table -->"
+_END = "<!-- end of parameters -->"
+
+
+def parameter_tables() -> str:
+    """Tables of all parameters of all nodes, in Markdown."""
+    parts = []
+    for node, own in NODE_CONFIGS.items():
+        rows = [_row(*item) for item in settings_of(own)]
+        for prefix, config_type in GROUPS[node]:
+            rows += [_row(*item) for item in settings_of(config_type, prefix)]
+        header = "| parameter | type | default | range | meaning |\n|---|---|---|---|---|"
+        parts.append(f"### {node}\n\n{header}\n" + "\n".join(rows))
+    return "\n\n".join(parts)
+
+
+def _row(name: str, config_type: type[Config], field: dataclasses.Field[Any]) -> str:
+    kind = parameter_type(config_type, field).name.lower().replace("_", " ")
+    low, high, choices = (field.metadata.get(key) for key in ("low", "high", "choices"))
+    bounds = ""
+    if choices:
+        bounds = ", ".join(choices)
+    elif low is not None and high is not None:
+        bounds = f"{low:g} to {high:g}" if kind == "double" else f"{low} to {high}"
+    text = field.metadata.get("doc", "").replace("|", "\\|").replace("<", "\\<")
+    return f"| `{name}` | {kind} | {_default(field.default)} | {bounds} | {text} |"
+
+
+def _default(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(str, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return '""' if value == "" else str(value)
+
+
+def with_tables(text: str) -> str:
+    """The text of a page, its tables made anew.
+
+    Raises
+    ------
+    DataError
+        If the page has no place for them.
+    """
+    head, begin, rest = text.partition(_BEGIN)
+    _, end, tail = rest.partition(_END)
+    if not begin or not end:
+        raise DataError(f"no place for the tables: expected a line {_BEGIN!r} and one {_END!r}")
+    return f"{head}{_BEGIN}\n\n{parameter_tables()}\n\n{_END}{tail}"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Renew the tables of the page that is named."""
+    path = Path((sys.argv[1:] if argv is None else argv)[0])
+    path.write_text(with_tables(path.read_text()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
