@@ -64,7 +64,15 @@ class SE2:
 
     def apply(self, points: ArrayLike) -> FloatArray:
         """Move points (N, 2) [m], or one point (2,), from source to target coordinates."""
-        return np.asarray(points, dtype=np.float64) @ self.rotation().T + (self.x, self.y)
+        points = np.asarray(points, dtype=np.float64)
+        x, y = points[..., 0], points[..., 1]
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        # Written out it is five times as fast as a product of such narrow matrices, and the last
+        # digit does not depend on a linear-algebra library.
+        moved = np.empty(points.shape)
+        moved[..., 0] = cos * x - sin * y + self.x
+        moved[..., 1] = sin * x + cos * y + self.y
+        return moved
 
     def rotation(self) -> FloatArray:
         """Rotation matrix (2, 2)."""
