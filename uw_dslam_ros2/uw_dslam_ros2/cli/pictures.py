@@ -409,9 +409,10 @@ def _draw_way(axes: Axes, trajectory: Trajectory, color: str) -> None:
 
 def _draw_seam(axes: Axes, grid: OccupancyMap, T_map_submap: SE2, color: str) -> None:
     factor = max(1, max(grid.spec.shape) // 300)
-    # Opening drops the single beams at the rim of what a submap has seen.
+    # Shadows within, and single beams at the rim of what a submap has seen, are no seams.
     known = grid.known[::factor, ::factor].astype(np.uint8)
-    known = cv2.morphologyEx(known, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    known = cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8))
+    known = cv2.morphologyEx(known, cv2.MORPH_OPEN, np.ones((11, 11), np.uint8))
     contours, _ = cv2.findContours(known, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for contour in contours:
         if cv2.contourArea(contour) < 0.02 * known.sum():
