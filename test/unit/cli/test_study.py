@@ -1,10 +1,13 @@
 """The study command: every study is offered, and what it writes can be read."""
 
 import csv
+import os
 from itertools import pairwise
 
 import pytest
 
+from uw_dslam_ros2.cli.studies import sigma
+from uw_dslam_ros2.cli.studies._trials import Cell
 from uw_dslam_ros2.cli.study import build_parser, main, study_names
 
 
@@ -75,3 +78,38 @@ def test_outliers_writes_trials_that_agree_with_its_summary(tmp_path, capsys):
 def test_outliers_refuses_an_unknown_method(tmp_path, capsys):
     assert main(["outliers", "--out", str(tmp_path), "--methods", "magic"]) == 1
     assert "magic" in capsys.readouterr().err
+
+
+def test_nnde_says_which_recording_is_missing(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("UW_DATA_DIR", raising=False)
+    assert main(["nnde", "--out", str(tmp_path)]) == 1
+    assert "freiburg079" in capsys.readouterr().err
+    assert main(["nnde", "--out", str(tmp_path), "--data", str(tmp_path / "nowhere")]) == 1
+    assert "nowhere" in capsys.readouterr().err
+
+
+@pytest.mark.data
+@pytest.mark.skipif("UW_DATA_DIR" not in os.environ, reason="UW_DATA_DIR names no recordings")
+def test_nnde_registers_scans_of_the_recording(tmp_path, capsys):
+    assert main(["nnde", "--out", str(tmp_path), "--pairs", "3", "--voxel", "0.3"]) == 0
+    assert (tmp_path / "figure5.png").exists()
+    with (tmp_path / "nnde.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * 4
+    engine = [float(row["error_deg"]) for row in rows if row["stage"] == "engine"]
+    assert sorted(engine)[1] < 3.0  # the median pair
+    assert "second registration" in capsys.readouterr().out
+
+
+def test_sigma_compares_fixed_kernels_with_the_ladder(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sigma, "_CELLS", (Cell(15, 0.3), Cell(15, 0.0, 0.02)))
+    monkeypatch.setattr(sigma, "_FACTORS", (0.3, 1.0))
+    assert main(["sigma", "--out", str(tmp_path), "--trials", "2"]) == 0
+    with (tmp_path / "sigma.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * (2 + 1 + 1)  # fixed kernels, the paper's, the ladder
+    assert [row["is_paper"] for row in rows].count("1") == 2
+    for row in rows:
+        if row["is_paper"] == "1":
+            assert float(row["sigma_m"]) == pytest.approx(0.1)
+    assert "ladder" in capsys.readouterr().out

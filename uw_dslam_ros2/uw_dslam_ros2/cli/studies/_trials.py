@@ -9,10 +9,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.studies._common import is_success, progress, summary
-from uw_dslam_ros2.core.registration import RegistrationConfig, register_point_sets
+from uw_dslam_ros2.core.registration import (
+    PriorWindow,
+    RegistrationConfig,
+    register_point_sets,
+)
 from uw_dslam_ros2.core.registration.baselines import icp, point_baselines, procrustes
+from uw_dslam_ros2.core.registration.branch_and_bound import SearchSettings, Term, search
+from uw_dslam_ros2.core.registration.field import mixture_field
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem, overlap_problem
 
@@ -25,8 +32,13 @@ __all__ = [
     "Trial",
     "method_names",
     "run_cell",
+    "search_mixture",
     "summarise",
 ]
+
+FloatArray = NDArray[np.float64]
+
+_MAX_BOXES = 300_000
 
 ENGINE = "engine"
 PAPER = "engine, paper's method"
@@ -117,6 +129,25 @@ def run_cell(
             good = is_success(T_found, T_true)
             trials.append(Trial(cell, name, seed, good, is_refused, error_rad, error_m, cpu_s))
     return trials
+
+
+def search_mixture(
+    source: FloatArray, target: FloatArray, sigma_m: float, prior: PriorWindow | None = None
+) -> SE2:
+    """Optimum of the paper's objective, all components with the same `sigma_m`, nothing refined.
+
+    A kernel far below the spacing has countless equal peaks: the search stops at a number of
+    boxes that others never need, with the best pose so far.
+    """
+    field = mixture_field(
+        target, np.ones(len(target)), np.full(len(target), math.sqrt(2.0) * sigma_m)
+    )
+    found = search(
+        [Term(source, np.ones(len(source)), field)],
+        SearchSettings(max_boxes=_MAX_BOXES),
+        prior=prior,
+    )
+    return found.T_target_source
 
 
 def summarise(trials: Iterable[Trial]) -> list[dict[str, Any]]:
