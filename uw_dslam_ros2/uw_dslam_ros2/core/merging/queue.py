@@ -16,6 +16,7 @@ from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
 from uw_dslam_ros2.core.merging.graph import residual
 from uw_dslam_ros2.core.merging.library import Library, Memory
+from uw_dslam_ros2.core.merging.pairwise import make_pairwise_plan
 from uw_dslam_ros2.core.merging.plan import Plan, make_plan
 from uw_dslam_ros2.core.merging.settling import LoopError, loop_errors
 from uw_dslam_ros2.core.merging.state import QueueState
@@ -292,7 +293,11 @@ class MapQueue:
                 return Plan([], [], [], [])
             anchor = self._anchor or min(self._submaps)
             library = self._current_library()
-            plan = make_plan(library, self._answers, self._standing, anchor, self._config)
+            if self._config.mode == "pairwise":
+                vehicles = self._vehicles
+                plan = make_pairwise_plan(library, vehicles, self._answers, anchor, self._config)
+            else:
+                plan = make_plan(library, self._answers, self._standing, anchor, self._config)
             self._standing = frozenset(joint.key for joint in plan.joints if joint.is_inlier)
             self._plan_cache = plan
         return self._plan_cache

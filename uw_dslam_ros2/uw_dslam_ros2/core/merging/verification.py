@@ -67,7 +67,7 @@ class Verifier:
         source, target
             All that the two maps belong to.
         """
-        answer = self._ask(match)
+        answer = self.ask(match)
         if answer is None or not answer.is_guess:
             return []
         if not answer.is_accepted and answer.probability < _WORTH_CHECKING:
@@ -385,10 +385,11 @@ class Verifier:
 
     def _ask_all(self, matches: Sequence[Match]) -> list[Answer] | None:
         """All answers, or None while one is missing."""
-        replies = [reply for match in matches if (reply := self._ask(match)) is not None]
+        replies = [reply for match in matches if (reply := self.ask(match)) is not None]
         return replies if len(replies) == len(matches) else None
 
-    def _ask(self, match: Match) -> Answer | None:
+    def ask(self, match: Match) -> Answer | None:
+        """The answer, if there is one; otherwise the question is noted as wanted."""
         units = match.source.key, match.target.key
         for earlier in self._replies.get(units, ()):
             if match.prior is not None and earlier.is_guess and earlier.is_inside(match.prior):

@@ -1,0 +1,114 @@
+"""Merging of many submaps: searches, time and memory over their number.
+
+``python benchmarks/bench_merging.py [CASE ...] [--quick]`` prints one JSON line per measurement.
+The matcher knows the truth, so that only the merging is timed; every case checks the poses first.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import tracemalloc
+
+import numpy as np
+from harness import Timing, emit, require, run_cases, timed
+
+from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.sim.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
+
+_MAX_RMSE_M = 0.5  # one cell
+
+
+def batch(quick: bool) -> None:
+    """All submaps at once. Searches and time over their number, up to 10 vehicles x 10."""
+    sizes = (2, 4) if quick else (2, 4, 6, 8, 10)
+    numbers, searches, seconds = [], [], []
+    for size in sizes:
+        fleet = lawnmower_fleet(size, size, 0)
+        timing = Timing()
+        queue, num_searches = timed(lambda f=fleet: _settled(f), timing)
+        total = len(fleet.submaps)
+        numbers.append(total)
+        searches.append(num_searches)
+        seconds.append(timing.cpu_s[0])
+        emit(
+            "batch",
+            {
+                "num_submaps": total,
+                "num_searches": num_searches,
+                "num_pairs": total * (total - 1) // 2,
+                "searches_per_pair": num_searches / (total * (total - 1) / 2),
+                "rmse_m": fleet.position_rmse_m(queue),
+                **timing.row(),
+            },
+        )
+    slopes = _slope(numbers, searches), _slope(numbers, seconds)
+    emit("batch exponents", {"searches_exponent": slopes[0], "cpu_exponent": slopes[1]})
+
+
+def incremental(quick: bool) -> None:
+    """Submaps one by one, vehicles in turn. Time for each, once all answers are in."""
+    size = 3 if quick else 10
+    fleet = lawnmower_fleet(size, size, 0)
+    matcher, queue = KnowingMatcher(fleet), MapQueue()
+    drawing, planning = Timing(), Timing()
+    num_searches = 0
+    for submap_id in sorted(fleet.submaps, key=lambda i: (i[1], i[0])):
+        timed(lambda i=submap_id: _add_and_draw(queue, fleet, i), drawing)
+        num_searches += timed(lambda: answer_all(queue, matcher), planning)
+    _check(fleet, queue)
+    emit(
+        "incremental",
+        {
+            "num_submaps": len(fleet.submaps),
+            "num_searches": num_searches,
+            "rmse_m": fleet.position_rmse_m(queue),
+            **drawing.row("add_and_draw_"),
+            **planning.row("settle_"),
+        },
+    )
+
+
+def memory(quick: bool) -> None:
+    """Bytes that a settled queue holds, beside those of the submaps' grids."""
+    size = 3 if quick else 10
+    fleet = lawnmower_fleet(size, size, 0)
+    tracemalloc.start()
+    queue, _ = _settled(fleet)
+    held, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    grids = sum(submap.grid.values.nbytes for submap in fleet.submaps.values())
+    require(queue.global_map() is not None, "no map")
+    emit("memory", {"num_submaps": size**2, "grids": grids, "held": held, "peak": peak})
+
+
+def _settled(fleet: Fleet) -> tuple[MapQueue, int]:
+    queue = MapQueue()
+    for submap_id in sorted(fleet.submaps):
+        queue.add_submap(fleet.submaps[submap_id])
+    num_searches = answer_all(queue, KnowingMatcher(fleet))
+    _check(fleet, queue)
+    return queue, num_searches
+
+
+def _check(fleet: Fleet, queue: MapQueue) -> None:
+    require({r.component for r in queue.submaps()} == {0}, "not all submaps are merged")
+    error_m = fleet.position_rmse_m(queue)
+    require(error_m <= _MAX_RMSE_M, f"{error_m} m off")
+    require(queue.global_map() is not None, "no map")
+
+
+def _add_and_draw(queue: MapQueue, fleet: Fleet, submap_id: tuple[str, int]) -> None:
+    queue.add_submap(fleet.submaps[submap_id])
+    queue.changed_window()
+
+
+def _slope(numbers: list[int], values: list[float]) -> float:
+    if len(numbers) < 2:
+        return math.nan
+    return float(np.polyfit(np.log(numbers), np.log(values), 1)[0])
+
+
+if __name__ == "__main__":
+    cases = {"batch": batch, "incremental": incremental, "memory": memory}
+    sys.exit(run_cases(__doc__ or "", cases))

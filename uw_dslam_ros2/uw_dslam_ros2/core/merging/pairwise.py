@@ -1,0 +1,109 @@
+"""The paper's queue of maps, plainly: take two, register them, put the merged one back.
+
+Zhang et al. 2023, Algorithm 1: no checks, no graph, and nothing is taken back. For comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from uw_dslam_ros2.core.mapping.submap import SubmapId
+from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
+from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.library import Library
+from uw_dslam_ros2.core.merging.plan import Plan
+from uw_dslam_ros2.core.merging.settling import Component, Joint
+from uw_dslam_ros2.core.merging.verification import Verifier
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["make_pairwise_plan"]
+
+
+def make_pairwise_plan(
+    library: Library,
+    vehicles: Sequence[str],
+    answers: Mapping[MatchKey, Answer],
+    anchor: SubmapId,
+    config: MapQueueConfig,
+) -> Plan:
+    """Merge the vehicles' maps in the order given, and say which question is open.
+
+    The first map of the queue is matched with the next one. A merged map goes to the end; a map
+    that matches no other goes there too, and is tried again with what has been merged meanwhile.
+
+    Parameters
+    ----------
+    library
+        The submaps; each vehicle's are one map by its own odometry.
+    vehicles
+        In order of arrival.
+    answers
+        By the key of the question.
+    anchor
+        The submap that the global frame is pinned to.
+    config
+        Settings.
+    """
+    verifier = Verifier(library, answers, config)
+    queue = [_vehicle_map(library, vehicle) for vehicle in vehicles]
+    idle = [c for c in queue if not library.component_side(c).T_frame_submap]
+    queue = [component for component in queue if component not in idle]
+    refused: set[frozenset[bytes]] = set()
+    joints: list[Joint] = []
+    num_refused = 0
+    while len(queue) > 1 and num_refused < len(queue):
+        first, rest = queue[0], queue[1:]
+        merged = _merge_first(library, verifier, first, rest, joints, refused)
+        if verifier.wanted:
+            break
+        if merged is None:
+            queue, num_refused = [*rest, first], num_refused + 1
+        else:
+            index, component = merged
+            queue, num_refused = [*rest[:index], *rest[index + 1 :], component], 0
+    components = [_anchored(component, anchor) for component in (*queue, *idle)]
+    components.sort(key=lambda component: (anchor not in component, min(component)))
+    wanted = list(verifier.wanted.values())
+    return Plan(wanted, joints, library.odometry.edges, components)
+
+
+def _vehicle_map(library: Library, vehicle: str) -> Component:
+    ids = sorted(submap_id for submap_id in library.submaps if submap_id[0] == vehicle)
+    T_first_odom = library.odometry.T_odom_submap(ids[0]).inverse()
+    return {i: T_first_odom @ library.odometry.T_odom_submap(i) for i in ids}
+
+
+def _merge_first(
+    library: Library,
+    verifier: Verifier,
+    first: Component,
+    rest: Sequence[Component],
+    joints: list[Joint],
+    refused: set[frozenset[bytes]],
+) -> tuple[int, Component] | None:
+    """Index of the map that the first one was merged with, and the merged map."""
+    target = library.component_unit(library.component_side(first))
+    for index, other in enumerate(rest):
+        source = library.component_unit(library.component_side(other))
+        pair = frozenset((source.key, target.key))
+        if pair in refused:
+            continue  # asked the other way round
+        answer = verifier.ask(Match(source, target))
+        if answer is None:
+            return None
+        refused.add(pair)
+        if answer.is_accepted:
+            joints.append(verifier.joint(answer))
+            T_first_other = (
+                first[target.reference]
+                @ answer.T_target_source
+                @ other[source.reference].inverse()
+            )
+            return index, first | {i: T_first_other @ T for i, T in other.items()}
+    return None
+
+
+def _anchored(component: Component, anchor: SubmapId) -> Component:
+    root = anchor if anchor in component else min(component)
+    T_root_frame = component[root].inverse()
+    return {i: SE2() if i == root else T_root_frame @ T for i, T in component.items()}
