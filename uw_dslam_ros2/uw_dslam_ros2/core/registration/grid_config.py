@@ -30,8 +30,11 @@ class GridRegistrationConfig(Config):
     max_seconds: float = setting(20.0, 0.1, 3600.0, "time before giving up [s]; needs a clock")
     min_wall_cells: int = setting(25, 1, 100000, "fewer wall cells in a map are too few")
     min_overlap: float = setting(0.1, 0.0, 1.0, "least common seen area, share of the smaller")
-    max_conflict: float = setting(0.5, 0.0, 1.0, "walls on free space, share of common walls")
+    max_conflict: float = setting(0.4, 0.0, 1.0, "walls on free space, share of common walls")
     max_rival_share: float = setting(
         0.9, 0.1, 1.0, "a rival's score from which on it is ambiguous"
+    )
+    max_slide_share: float = setting(
+        0.85, 0.1, 1.0, "score ten cells off in the weakest direction; a straight wall keeps it"
     )
     min_probability: float = setting(0.9, 0.0, 1.0, "least probability of an accepted match")

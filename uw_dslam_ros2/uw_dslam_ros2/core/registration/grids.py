@@ -24,11 +24,10 @@ from uw_dslam_ros2.core.registration.grid_search import (
 )
 from uw_dslam_ros2.core.registration.paper_grids import register_grids_by_points
 from uw_dslam_ros2.core.registration.refine_grids import (
-    Agreement,
     WallMap,
-    curvature,
     measure_agreement,
     pose_covariance,
+    slide_share,
 )
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
@@ -52,6 +51,10 @@ _FINE_SIGMA_CELLS = 2.0
 _LEAST_SIDE_CELLS = 4
 _NUM_BOXES_OF_REFUSED = 20_000
 _RIVAL_SHARE = 0.5
+_SLIDE_CELLS = 10.0
+# Errors of neighbouring wall cells go together: bends, and one wall seen from one place.
+_CELLS_PER_PAIR = 40.0
+_RESIDUAL_CELLS = 0.95
 
 
 def register_grids(
@@ -315,13 +318,12 @@ class _GridMatch:
         T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
         agreement = measure_agreement(WallMap(sides[0]), WallMap(sides[1]), T_cells)
         shares = [c.score / best.score if best.score > 0.0 else 1.0 for c in refined[1:]]
-        values = np.linalg.eigvalsh(curvature(finest, best.pose))
         evidence = MatchEvidence(
             agreement=agreement,
             score=best.score,
             surprise=surprise,
             rival_share=max(shares, default=0.0),
-            stiffness=max(float(values[0]), 0.0) / max(float(values[-1]), 1e-12),
+            slide_share=slide_share(finest, best.pose, _SLIDE_CELLS),
         )
         return _Found(refined, tuple(shares), evidence)
 
@@ -350,7 +352,7 @@ class _GridMatch:
             verdict=verdict,
             reason=reason,
             T_target_source=motion,
-            covariance=self._covariance(finest, pose, agreement, motion),
+            covariance=self._covariance(finest, pose, found.evidence, motion),
             probability=probability,
             score=outcome.lower_bound,
             lower_bound=outcome.lower_bound,
@@ -369,11 +371,18 @@ class _GridMatch:
         )
 
     def _covariance(
-        self, problem: GridProblem, pose: FloatArray, agreement: Agreement, motion: SE2
+        self, problem: GridProblem, pose: FloatArray, evidence: MatchEvidence, motion: SE2
     ) -> FloatArray:
         """Covariance of ``T_target_source`` [m, m, rad] from that of the pose."""
-        num_walls = max(agreement.num_walls, 1) / 40.0
-        covariance = pose_covariance(problem, pose, num_walls, _FINE_SIGMA_CELLS)
+        agreement = evidence.agreement
+        # Bent maps leave larger residuals, and their errors are common to whole walls: on
+        # simulated pairs the variance grows with the fourth power of the residual
+        # .
+        growth = max((agreement.residual_cells / _RESIDUAL_CELLS) ** 4, 0.05)
+        num_pairs = max(agreement.num_walls, 1) / (_CELLS_PER_PAIR * growth)
+        covariance = pose_covariance(
+            problem, pose, num_pairs, _FINE_SIGMA_CELLS, evidence.slide_share
+        )
         rotation = self._target.spec.T_frame_grid.rotation()
         center = self._points(problem.center[None, :], problem.resolution_m, self._source)[0]
         arm = motion.rotation() @ center

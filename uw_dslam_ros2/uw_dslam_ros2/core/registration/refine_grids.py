@@ -13,7 +13,7 @@ from uw_dslam_ros2.core.registration import grid_kernels
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["Agreement", "curvature", "measure_agreement", "pose_covariance"]
+__all__ = ["Agreement", "curvature", "measure_agreement", "pose_covariance", "slide_share"]
 
 FloatArray = NDArray[np.float64]
 
@@ -64,6 +64,7 @@ class WallMap:
 
 _NEAR_CELLS = 2.5
 _FAR_CELLS = 3.5
+_FREE_SLIDE_SHARE = 0.85  # as good as free: the pose may be anywhere along the map
 
 
 def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreement:
@@ -114,8 +115,19 @@ def curvature(problem: GridProblem, pose: FloatArray) -> FloatArray:
     return -0.5 * (hessian + hessian.T)
 
 
+def slide_share(problem: GridProblem, pose: FloatArray, distance_cells: float) -> float:
+    """Objective some cells away in the least curved direction, as a share of that at the pose.
+
+    Near 1 where the walls leave a direction free, as a straight wall does.
+    """
+    _, vectors = np.linalg.eigh(curvature(problem, pose))
+    step = distance_cells * vectors[:, 0] * (1.0 / problem.radius, 1.0, 1.0)
+    best = max(problem.value(pose), 1e-9)
+    return max(problem.value(pose + step), problem.value(pose - step), 0.0) / best
+
+
 def pose_covariance(
-    problem: GridProblem, pose: FloatArray, num_pairs: float, sigma_cells: float
+    problem: GridProblem, pose: FloatArray, num_pairs: float, sigma_cells: float, slide: float
 ) -> FloatArray:
     """Covariance (3, 3) of [theta, t_x, t_y] in [rad, cells] from the objective's curvature.
 
@@ -127,6 +139,8 @@ def pose_covariance(
     # Directions that the maps do not fix at all get the size of the map, not infinity.
     floor = max(float(values.max()), 1e-9) * 1e-5
     information = np.maximum(values, floor) / max(problem.value(pose), 1e-6) * num_pairs
+    if slide > _FREE_SLIDE_SHARE:
+        information[0] = 1.0 / (sigma_cells * problem.radius) ** 2
     inverse = vectors @ np.diag(1.0 / (information * sigma_cells**2)) @ vectors.T
     scale = np.diag([1.0 / problem.radius, 1.0, 1.0])
     return scale @ inverse @ scale
