@@ -46,13 +46,14 @@ class MatchConfig(Config):
     """Scan-to-submap matching."""
 
     sigma_m: float = setting(0.12, 0.01, 10.0, "width of the likelihood field: noise of an echo")
-    key_distance_m: float = setting(0.5, 0.0, 100.0, "a ping is matched after this way ...")
-    key_turn_rad: float = setting(0.1, 0.0, 3.2, "... or this turn ...")
+    key_distance_m: float = setting(1.0, 0.0, 100.0, "a ping is matched after this way ...")
+    key_turn_rad: float = setting(0.15, 0.0, 3.2, "... or this turn ...")
     key_interval_s: float = setting(5.0, 0.0, 1e4, "... or this time")
     window_m: float = setting(2.0, 0.05, 100.0, "search at most this far from dead reckoning")
     window_rad: float = setting(0.15, 0.001, 3.2, "search at most this far from its yaw")
     local_length_m: float = setting(15.0, 0.1, 1e4, "way whose echoes a ping is matched against")
     min_points: int = setting(20, 3, 100000, "fewer echoes are not matched")
+    max_points: int = setting(300, 10, 100000, "of more echoes an even choice is matched")
     min_overlap: float = setting(0.3, 0.0, 1.0, "share of the echoes that must meet known ones")
     information_share: float = setting(
         0.1, 0.001, 1.0, "independent information per echo: neighbouring echoes err together"
@@ -72,11 +73,15 @@ class LoopConfig(Config):
     max_window_rad: float = setting(
         0.35, 0.01, 3.2, "largest half width of the search window in yaw"
     )
-    min_overlap: float = setting(
-        0.45, 0.0, 1.0, "share of the points that must meet the other map"
-    )
+    min_overlap: float = setting(0.5, 0.0, 1.0, "share of the points that must meet the other map")
     min_lead: float = setting(
         0.05, 0.0, 1.0, "lead over the best other pose, as a share of the score"
+    )
+    max_conflict: float = setting(
+        0.1, 0.0, 1.0, "share of the points that may fall on free water of the other map"
+    )
+    num_context: int = setting(
+        0, 0, 20, "neighbouring submaps that are matched along with each of the two"
     )
     min_points: int = setting(60, 3, 100000, "submaps with fewer points are not matched")
     max_points: int = setting(600, 10, 100000, "points of a submap that are matched")

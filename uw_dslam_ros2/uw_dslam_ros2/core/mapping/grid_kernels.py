@@ -50,6 +50,58 @@ def beam_table(bearing, half_width, num_directions):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True)
+def _add_water(  # type: ignore[no-untyped-def]
+    evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
+    table, free_range, free, echo, first_row, first_col,
+):  # fmt: skip
+    """Take `free` from every cell that a beam crosses before its free range, echoes excepted."""
+    num_rows, num_cols = evidence.shape
+    num_directions = table.shape[0]
+    scale = num_directions / 4.0
+    squares = free_range * free_range
+    reach = 0.0
+    low_x = high_x = sonar_x
+    low_y = high_y = sonar_y
+    for k in range(num_directions):
+        if table[k] >= 0:
+            rng = free_range[table[k]]
+            reach = max(reach, rng)
+            # Back from the diamond angle to a direction.
+            p = (k + 0.5) / scale - 2.0
+            ux = 1.0 - abs(p)
+            uy = p if abs(p) <= 1.0 else np.sign(p) * (2.0 - abs(p))
+            size = rng / np.sqrt(ux * ux + uy * uy)
+            px, py = sonar_x + (cos * ux - sin * uy) * size, sonar_y + (sin * ux + cos * uy) * size
+            low_x, high_x = min(low_x, px), max(high_x, px)
+            low_y, high_y = min(low_y, py), max(high_y, py)
+    r0 = max(0, int(np.floor(low_y / resolution)) - 1 - origin_row)
+    r1 = min(num_rows - 1, int(np.floor(high_y / resolution)) + 1 - origin_row)
+    for row in range(r0, r1 + 1):
+        dy = (origin_row + row + 0.5) * resolution - sonar_y
+        if abs(dy) >= reach:
+            continue
+        chord = np.sqrt(reach * reach - dy * dy)
+        left, right = (
+            max(low_x - resolution, sonar_x - chord),
+            min(high_x + resolution, sonar_x + chord),
+        )
+        c0 = max(0, int(np.floor(left / resolution)) - origin_col)
+        c1 = min(num_cols - 1, int(np.floor(right / resolution)) - origin_col)
+        echo_row = row - first_row
+        has_echo = 0 <= echo_row < echo.shape[0]
+        for col in range(c0, c1 + 1):
+            dx = (origin_col + col + 0.5) * resolution - sonar_x
+            lx, ly = cos * dx + sin * dy, -sin * dx + cos * dy
+            beam = table[min(int((diamond(lx, ly) + 2.0) * scale), num_directions - 1)]
+            if beam >= 0 and dx * dx + dy * dy < squares[beam]:
+                echo_col = col - first_col
+                if has_echo and 0 <= echo_col < echo.shape[1] and echo[echo_row, echo_col] > 0:
+                    continue
+                evidence[row, col] -= free
+                observed[row, col] = True
+
+
+@njit(cache=True, nogil=True)
 def add_ping(  # type: ignore[no-untyped-def]
     evidence, observed, origin_row, origin_col, resolution,
     sonar_x, sonar_y, sonar_yaw,
@@ -63,38 +115,32 @@ def add_ping(  # type: ignore[no-untyped-def]
     """
     num_rows, num_cols = evidence.shape
     cos, sin = np.cos(sonar_yaw), np.sin(sonar_yaw)
-    reach = 0.0
-    for b in range(free_range.shape[0]):
-        reach = max(reach, free_range[b])
+    count = points.shape[0]
+    axes = np.empty((count, 6))  # of each echo: place, direction, spread along and across
     low_x = high_x = sonar_x
     low_y = high_y = sonar_y
-    low_x, high_x, low_y, high_y = low_x - reach, high_x + reach, low_y - reach, high_y + reach
-    for i in range(points.shape[0]):
-        px = sonar_x + cos * points[i, 0] - sin * points[i, 1]
-        py = sonar_y + sin * points[i, 0] + cos * points[i, 1]
-        margin = 2.0 * (max_spread + sigma_range) + resolution
-        low_x, high_x = min(low_x, px - margin), max(high_x, px + margin)
-        low_y, high_y = min(low_y, py - margin), max(high_y, py + margin)
+    for i in range(count):
+        rng = np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
+        ux, uy = (points[i, 0] / rng, points[i, 1] / rng) if rng > 0.0 else (1.0, 0.0)
+        axes[i, 0] = sonar_x + cos * points[i, 0] - sin * points[i, 1]
+        axes[i, 1] = sonar_y + sin * points[i, 0] + cos * points[i, 1]
+        axes[i, 2], axes[i, 3] = cos * ux - sin * uy, sin * ux + cos * uy
+        # The echo lies on an arc: sharp in range, as wide as the beam across. At least half a
+        # cell, so that it shows.
+        axes[i, 4] = max(sigma_range, 0.5 * resolution)
+        axes[i, 5] = max(min(0.5 * beamwidth * rng, max_spread), 0.5 * resolution)
+        span = 2.0 * max(axes[i, 4], axes[i, 5])
+        low_x, high_x = min(low_x, axes[i, 0] - span), max(high_x, axes[i, 0] + span)
+        low_y, high_y = min(low_y, axes[i, 1] - span), max(high_y, axes[i, 1] + span)
     first_col = max(0, int(np.floor(low_x / resolution)) - origin_col)
     last_col = min(num_cols - 1, int(np.floor(high_x / resolution)) - origin_col)
     first_row = max(0, int(np.floor(low_y / resolution)) - origin_row)
     last_row = min(num_rows - 1, int(np.floor(high_y / resolution)) - origin_row)
-    if last_col < first_col or last_row < first_row:
-        return
-    echo = np.zeros((last_row - first_row + 1, last_col - first_col + 1), np.int32)
-    for i in range(points.shape[0]):
-        rng = np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
-        if rng == 0.0:
-            continue
-        # The echo lies on an arc: sharp in range, as wide as the beam across. At least half a
-        # cell, so that it shows.
-        sr = max(sigma_range, 0.5 * resolution)
-        st = max(min(0.5 * beamwidth * rng, max_spread), 0.5 * resolution)
-        ux, uy = points[i, 0] / rng, points[i, 1] / rng
-        ax, ay = cos * ux - sin * uy, sin * ux + cos * uy
-        px = sonar_x + ax * rng
-        py = sonar_y + ay * rng
-        span = 2.0 * max(sr, st)
+    height, width = max(0, last_row - first_row + 1), max(0, last_col - first_col + 1)
+    echo = np.zeros((height, width), np.int32)
+    for i in range(count):
+        px, py, ax, ay = axes[i, 0], axes[i, 1], axes[i, 2], axes[i, 3]
+        span = 2.0 * max(axes[i, 4], axes[i, 5])
         c0 = max(first_col, int(np.floor((px - span) / resolution)) - origin_col)
         c1 = min(last_col, int(np.floor((px + span) / resolution)) - origin_col)
         r0 = max(first_row, int(np.floor((py - span) / resolution)) - origin_row)
@@ -106,34 +152,22 @@ def add_ping(  # type: ignore[no-untyped-def]
             for col in range(c0, c1 + 1):
                 dx = (origin_col + col + 0.5) * resolution - px
                 along, across = ax * dx + ay * dy, -ay * dx + ax * dy
-                size = (along / sr) ** 2 + (across / st) ** 2
+                size = (along / axes[i, 4]) ** 2 + (across / axes[i, 5]) ** 2
                 if row == own_row and col == own_col:
                     size = 0.0
                 if size < 4.0:
                     value = np.int32(np.rint(hit * weight[i] * np.exp(-0.5 * size)))
                     slot = echo[row - first_row, col - first_col]
                     echo[row - first_row, col - first_col] = max(slot, value)
-    num_directions = table.shape[0]
-    scale = num_directions / 4.0
-    reach_squared = reach * reach
-    for row in range(first_row, last_row + 1):
-        dy = (origin_row + row + 0.5) * resolution - sonar_y
-        for col in range(first_col, last_col + 1):
-            value = echo[row - first_row, col - first_col]
-            if value > 0:
-                evidence[row, col] += value
-                observed[row, col] = True
-                continue
-            dx = (origin_col + col + 0.5) * resolution - sonar_x
-            squared = dx * dx + dy * dy
-            if squared >= reach_squared:
-                continue
-            lx, ly = cos * dx + sin * dy, -sin * dx + cos * dy
-            direction = int((diamond(lx, ly) + 2.0) * scale)
-            beam = table[min(direction, num_directions - 1)]
-            if beam >= 0 and squared < free_range[beam] * free_range[beam]:
-                evidence[row, col] -= free
-                observed[row, col] = True
+    _add_water(
+        evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
+        table, free_range, free, echo, first_row, first_col,
+    )  # fmt: skip
+    for row in range(height):
+        for col in range(width):
+            if echo[row, col] > 0:
+                evidence[first_row + row, first_col + col] += echo[row, col]
+                observed[first_row + row, first_col + col] = True
 
 
 @njit(cache=True, nogil=True)

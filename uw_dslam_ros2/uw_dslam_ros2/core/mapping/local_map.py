@@ -62,6 +62,8 @@ class LocalMap:
             sigmas.append(max(0.5 * sigmas[-1], config.sigma_m))
         fields = [LikelihoodField(known, support, s) for s in sigmas]
         source, source_weight = thin(points, weight, config.sigma_m)
+        stride = -(-len(source) // config.max_points)
+        source, source_weight = source[::stride], source_weight[::stride]
         return match_points(
             fields,
             source,

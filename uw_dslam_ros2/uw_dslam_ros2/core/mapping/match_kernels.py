@@ -9,25 +9,34 @@ __all__ = ["score_poses", "score_window", "splat"]
 
 
 @njit(cache=True, nogil=True)
-def splat(field, points, weight, origin_x, origin_y, cell, sigma):  # type: ignore[no-untyped-def]
-    """Add ``weight * exp(-d^2 / (2 sigma^2))`` of every point (N, 2) within 3.5 sigma."""
+def splat(field, points, weight, origin_x, origin_y, cell, sigma, support):  # type: ignore[no-untyped-def]
+    """Fill `field` with ``1 - exp(-density / support)``.
+
+    The density is the sum of ``weight * exp(-d^2 / (2 sigma^2))`` over the points (N, 2), each as
+    far as 3.5 sigma; `field` must come as zeros.
+    """
     num_rows, num_cols = field.shape
     reach = 3.5 * sigma
+    width = int(2.0 * reach / cell) + 3
+    along, across = np.empty(width), np.empty(width)
     for i in range(points.shape[0]):
         px, py = points[i, 0] - origin_x, points[i, 1] - origin_y
-        c0, c1 = (
-            max(0, int(np.floor((px - reach) / cell))),
-            min(num_cols - 1, int(np.floor((px + reach) / cell))),
-        )
-        r0, r1 = (
-            max(0, int(np.floor((py - reach) / cell))),
-            min(num_rows - 1, int(np.floor((py + reach) / cell))),
-        )
+        c0 = max(0, int(np.floor((px - reach) / cell)))
+        c1 = min(num_cols - 1, int(np.floor((px + reach) / cell)))
+        r0 = max(0, int(np.floor((py - reach) / cell)))
+        r1 = min(num_rows - 1, int(np.floor((py + reach) / cell)))
+        # A Gaussian is a product: one exponential for each column and each row.
+        for col in range(c0, c1 + 1):
+            along[col - c0] = np.exp(-0.5 * (((col + 0.5) * cell - px) / sigma) ** 2)
         for row in range(r0, r1 + 1):
-            dy = (row + 0.5) * cell - py
+            across[row - r0] = weight[i] * np.exp(-0.5 * (((row + 0.5) * cell - py) / sigma) ** 2)
+        for row in range(r0, r1 + 1):
             for col in range(c0, c1 + 1):
-                dx = (col + 0.5) * cell - px
-                field[row, col] += weight[i] * np.exp(-0.5 * (dx * dx + dy * dy) / (sigma * sigma))
+                field[row, col] += across[row - r0] * along[col - c0]
+    for row in range(num_rows):
+        for col in range(num_cols):
+            if field[row, col] > 0.0:
+                field[row, col] = 1.0 - np.exp(-field[row, col] / support)
 
 
 @njit(cache=True, nogil=True)

@@ -20,6 +20,7 @@ _MEETS = 0.25
 _MAX_CELLS = 4_000_000
 _MAX_STEPS = 12
 _NUM_STARTS = 8
+_START_SHARE = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,9 +52,10 @@ def thin(points: FloatArray, weight: FloatArray, cell_m: float) -> tuple[FloatAr
     """Replace the points (N, 2) of a square cell by their weighted mean; weights add up."""
     if len(points) == 0:
         return points, weight
-    keys = np.floor(points / cell_m).astype(np.int64)
-    _, inverse = np.unique(keys, axis=0, return_inverse=True)
-    inverse = inverse.ravel()
+    cells = np.floor(points / cell_m).astype(np.int64)
+    cells -= cells.min(axis=0)
+    keys = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    _, inverse = np.unique(keys, return_inverse=True)
     total = np.bincount(inverse, weights=weight)
     mean = np.column_stack(
         [np.bincount(inverse, weights=weight * points[:, k]) / total for k in (0, 1)]
@@ -78,20 +80,14 @@ class LikelihoodField:
         size = centers.max(axis=0) + 4.0 * sigma_m - low
         cell = max(0.5 * sigma_m, float(np.sqrt(size[0] * size[1] / _MAX_CELLS)))
         cols, rows = np.ceil(size / cell).astype(int)
-        density = np.zeros((rows, cols))
+        self.values = np.zeros((rows, cols))
         splat(
-            density,
-            centers,
-            1.0 - np.exp(-support),
-            float(low[0]),
-            float(low[1]),
-            cell,
-            max(sigma_m, 1.5 * cell),
-        )
+            self.values, centers, 1.0 - np.exp(-support), float(low[0]), float(low[1]),
+            cell, max(sigma_m, 1.5 * cell), _LINE_SUPPORT,
+        )  # fmt: skip
         self.sigma_m = sigma_m
         self.cell_m = cell
         self.origin = (float(low[0]), float(low[1]))
-        self.values = 1.0 - np.exp(-density / _LINE_SUPPORT)
 
     def scores(self, points: FloatArray, weight: FloatArray, poses: FloatArray) -> FloatArray:
         """Sums of weighted values under points (N, 2) at each pose (K, 3)."""
@@ -189,7 +185,7 @@ def match_points(
     hessian = _derivatives(field, source, weight, pose, field.sigma_m, float(scale))[2]
     values, vectors = np.linalg.eigh(-information_share * hessian)
     T_target_source = SE2.from_array(pose)
-    single = np.array([float(v) for v in _point_values(field, source, pose)])
+    single = _point_values(field, source, pose)
     return Match(
         T_target_source,
         (vectors * np.maximum(values, 0.0)) @ vectors.T,
@@ -241,6 +237,8 @@ def _search(
     flat = posterior.ravel()
     order = np.argpartition(-flat, min(len(flat) - 1, 400))[:400]
     order = order[np.lexsort((order, -flat[order]))]
+    # What is far behind already will not come first after a few Newton steps.
+    order = order[scores.ravel()[order] >= _START_SHARE * scores.ravel()[order[0]]]
     offsets = grid.reshape(-1, 3)[order]
     lattice = np.array([step, step, yaw_step])
     for offset in offsets:

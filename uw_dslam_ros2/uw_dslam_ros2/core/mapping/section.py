@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import SubmapConfig, VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, thin
+from uw_dslam_ros2.core.mapping.matcher import thin
 from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid, PackedEvidence
 from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.se2 import SE2
@@ -32,9 +32,9 @@ class ClosedSection:
     trajectory: FloatArray
     stamps_ns: NDArray[np.int64]
     covariance: FloatArray
+    drift: FloatArray
     T_odom_issued: SE2
     revision: int = 0
-    fields: dict[float, LikelihoodField] | None = None
 
     @property
     def center(self) -> FloatArray:
@@ -119,8 +119,8 @@ class OpenSection:
             or sigma_m >= config.max_sigma_m
         )
 
-    def close(self, T_odom_submap: SE2) -> ClosedSection:
-        """Freeze it."""
+    def close(self, T_odom_submap: SE2, drift: FloatArray) -> ClosedSection:
+        """Freeze it; `drift` (3, 3) is the covariance of its last pose relative to its first."""
         points = np.vstack(self._points) if self._points else np.empty((0, 2))
         weight = np.concatenate(self._weight) if self._weight else np.empty(0)
         points, weight = thin(points, weight, self._config.match.sigma_m)
@@ -133,6 +133,7 @@ class OpenSection:
             self.poses,
             self.stamps_ns,
             self._covariance,
+            drift,
             T_odom_submap,
         )
 

@@ -135,7 +135,8 @@ class VehicleMapper:
         self._navigation.start()
         issued = self._process_ready(flush=True)
         if self._open is not None:
-            issued += self._close()
+            last_ns = int(self._open.stamps_ns[-1])
+            issued += self._close(self._navigation.relative_at(last_ns)[1])
             self._open = None
         newest: dict[int, Submap] = {submap.sequence: submap for submap in issued}
         return [newest[sequence] for sequence in sorted(newest)]
@@ -282,7 +283,7 @@ class VehicleMapper:
         # At the submap's own start the covariance is zero, which may come out as a trace below it.
         sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
         if self._open.should_close(stamp_ns, sigma_m):
-            issued = self._close()
+            issued = self._close(covariance)
             self._begin(stamp_ns, T_submap_base, covariance)
             T_submap_base = SE2()
         self._open.add(detections, T_submap_base, T_base_sonar)
@@ -341,11 +342,11 @@ class VehicleMapper:
             self._local_map.add(T_submap_base.apply(points), detections.weight, T_submap_base)
         self._last_key = (stamp_ns, T_submap_base)
 
-    def _close(self) -> list[Submap]:
+    def _close(self, drift: FloatArray) -> list[Submap]:
         """Close the open submap, look for loops, and say which submaps are new or have moved."""
         assert self._open is not None
         poses = self._graph.poses
-        section = self._open.close(poses[-1])
+        section = self._open.close(poses[-1], drift)
         self._closed.append(section)
         self._open = None
         if self._config.estimator == "scan_matching" and self._config.loop.is_enabled:
