@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
@@ -112,6 +113,11 @@ def map_bags(
                     progress(done.value, total)
                 _raise_early(futures)
             return [future.result() for future in futures]
+        except BrokenProcessPool as error:
+            raise DataError(
+                "a mapping process was ended from outside; is there enough memory for "
+                f"{num_workers} vehicles at a time?"
+            ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
