@@ -60,7 +60,7 @@ def bound_box(problem, box):
     box, out = np.asarray(box), np.empty(5)
     first = kernels.bound_first(
         problem.points, problem.rows, problem.frames, problem.levels, problem.level_of,
-        problem.bounds, box,
+        problem.half_of, problem.bounds, problem.windows, box,
     )  # fmt: skip
     kernels.bound_second(
         problem.points, problem.rows, problem.frames, problem.half_of, problem.coefficients,

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration import (
@@ -159,3 +160,24 @@ def test_bad_input_is_named(arguments, name):
     points = np.random.default_rng(12).normal(size=(5, 2))
     with pytest.raises(InvalidInputError, match=name):
         register_point_sets(**({"source": points, "target": points} | arguments))
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.05])
+def test_the_covariance_is_calibrated(noise):
+    """Mean normalised error squared within its 95 % interval about three degrees of freedom."""
+    num_trials, errors = 24, []
+    for seed in range(num_trials):
+        source, target = scene(np.random.default_rng([30, seed]), 60, 10, 10, noise)
+        result = register_point_sets(source, target, RegistrationConfig(gap=0.1))
+        assert result.is_accepted, result.reason
+        error = result.T_target_source.as_array() - PLANTED.as_array()
+        errors.append(error @ np.linalg.solve(result.covariance, error))
+    low, high = chi2.ppf([0.025, 0.975], 3 * num_trials) / num_trials
+    assert low < np.mean(errors) < high
+
+
+def test_ten_percent_in_common_is_refused():
+    for seed in range(4):
+        source, target = scene(np.random.default_rng([31, seed]), 5, 45, 45, 0.02)
+        result = register_point_sets(source, target, RegistrationConfig(max_boxes=40_000))
+        assert not result.is_accepted, result.reason

@@ -43,7 +43,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration import kernels
-from uw_dslam_ros2.core.registration.field import Field, curvature_spans
+from uw_dslam_ros2.core.registration.field import Field, window_spans
 from uw_dslam_ros2.core.registration.result import PriorWindow, Progress
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -52,7 +52,7 @@ __all__ = ["SearchOutcome", "SearchSettings", "Status", "Term", "objective_at", 
 FloatArray = NDArray[np.float64]
 
 _BOX_BYTES = 7 * 8 + 8 + 4
-_SMALL = 7.0  # cells that a box may move the points by, for curvature to be tried
+_SMALL = 4.0  # cells that a box may move the points by, for curvature to be tried
 _CHUNK = 2048  # boxes between two looks at the clock
 
 
@@ -165,9 +165,10 @@ class Problem:
         self.levels = np.ascontiguousarray(np.concatenate(levels))
         self.coefficients = _joined([term.field.coefficients.ravel() for term in self.terms])
         self.bounds = _joined([term.field.bounds for term in self.terms])
+        self.windows = _joined([term.field.windows.ravel() for term in self.terms])
         self.curvatures = _joined([term.field.curvatures.ravel() for term in self.terms])
         self.level_of = _level_table(int(self.rows[:, 4:6].max()))
-        self.half_of = curvature_spans()
+        self.half_of = window_spans()
         self.window = self._window()
         weights = self.points[:, 2]
         spread = (self.points[:, :2] ** 2).sum(axis=1)
@@ -373,7 +374,7 @@ class _Search:
         p, settings = self._problem, self._settings
         kernels.run(
             p.points, p.rows, p.frames, p.levels, p.level_of, p.half_of,
-            p.coefficients, p.bounds, p.curvatures, p.window,
+            p.coefficients, p.bounds, p.windows, p.curvatures, p.window,
             p.arm, p.reach, p.margin, p.small, settings.gap, settings.keep, max_boxes,
             self._boxes, self._keys, self._heap, self._counters, self._best, self._found,
         )  # fmt: skip

@@ -36,7 +36,7 @@ IntArray = NDArray[np.int64]
 
 _BORDER = 3  # zero coefficients around the content, so that the spline itself ends at zero
 _TAIL_SIGMAS = 6.0
-_NUM_CURVATURE_LEVELS = 5  # two windows of 16 cells: larger boxes do not profit from curvature
+_NUM_WINDOWS = 6  # exact maxima up to 63 cells; beyond, windows that are a little too large
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +53,8 @@ class Field:
     coefficients: Float32Array  # (R, C)
     error: float  # proven bound of |spline - its formula|; 0 where the spline is the definition
     bounds: Float32Array  # flat, all levels of the maximum pyramid
-    curvatures: Float32Array  # (5, R, C): largest second derivative [1 / m^2] in 2^k x 2^k cells
+    windows: Float32Array  # (6, R, C): largest value in 2^k x 2^k cells from each cell on
+    curvatures: Float32Array  # (6, R, C): largest second derivative [1 / m^2] in 2^k x 2^k cells
     levels: IntArray  # (L, 3): offset, number of columns, right-shift of a cell index
 
     @property
@@ -64,7 +65,12 @@ class Field:
     @property
     def num_bytes(self) -> int:
         """Memory of all tables."""
-        return self.coefficients.nbytes + self.bounds.nbytes + self.curvatures.nbytes
+        return (
+            self.coefficients.nbytes
+            + self.bounds.nbytes
+            + self.windows.nbytes
+            + self.curvatures.nbytes
+        )
 
     def values(self, points: ArrayLike) -> FloatArray:
         """Values (N,) at points (N, 2) [m]."""
@@ -92,7 +98,7 @@ class Field:
         if cells is None:
             return 0.0
         col, row, last_col, last_row = cells
-        spans = curvature_spans()
+        spans = window_spans()
         span = max(last_col - col, last_row - row)
         if span >= len(spans):
             return math.inf
@@ -201,9 +207,9 @@ def likelihood_field(
     return _with_tables(coefficients.astype(np.float32), low, pitch_m, 0.0)
 
 
-def curvature_spans() -> NDArray[np.int8]:
+def window_spans() -> NDArray[np.int8]:
     """For every span, the level of which two overlapping windows hold exactly span + 1 cells."""
-    return np.log2(np.arange(1, 1 << _NUM_CURVATURE_LEVELS)).astype(np.int8)
+    return np.log2(np.arange(1, 1 << _NUM_WINDOWS)).astype(np.int8)
 
 
 def _lattice(
@@ -283,9 +289,12 @@ def _with_tables(
         level += 1
     table = np.array(levels, dtype=np.int64)
     bounds = np.empty(offset, dtype=np.float32)
-    curvatures = np.empty((_NUM_CURVATURE_LEVELS, num_rows, num_cols), dtype=np.float32)
+    windows = np.empty((_NUM_WINDOWS, num_rows, num_cols), dtype=np.float32)
+    curvatures = np.empty((_NUM_WINDOWS, num_rows, num_cols), dtype=np.float32)
     field_kernels.fill_first_level(coefficients, 1.0 / pitch_m**2, bounds, curvatures[0].ravel())
     field_kernels.fill_pyramid(bounds, table, len(table), num_rows)
+    windows[0] = bounds[: windows[0].size].reshape(windows[0].shape)
+    field_kernels.fill_windows(windows)
     field_kernels.fill_windows(curvatures)
     return Field(
         np.asarray(origin, dtype=np.float64),
@@ -293,6 +302,7 @@ def _with_tables(
         coefficients,
         error,
         bounds,
+        windows,
         curvatures,
         table,
     )

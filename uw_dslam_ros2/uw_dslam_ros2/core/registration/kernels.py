@@ -1,13 +1,13 @@
 # mypy: allow-untyped-defs
 """Compiled heart of the search: bounds of boxes, local ascent, the best-first loop over a heap.
 
-Everything is flat arrays. ``points`` (K, 4) hold x, y, weight and nothing; ``terms`` (T, 8)
-integers: first point, end point, is_inverse, offset of the coefficients, rows, columns, first
-level, offset of the curvatures; ``frames`` (T, 3): origin x, y and pitch; ``levels`` (L, 3):
-offset of the bounds, columns, shift, of all fields after each other; ``level_of[span]``: the level
-whose windows hold ``span + 1`` cells wherever they start; ``half_of[span]``: that of which two
-overlapping windows hold them exactly. ``heap`` holds every slot of ``boxes`` once: the open ones
-as a binary heap by ``keys``, behind them the free ones.
+Everything is flat arrays. ``points`` (K, 3) hold x, y, weight; ``terms`` (T, 8) integers: first
+point, end point, is_inverse, offset of the coefficients, rows, columns, first level, offset of the
+windows and curvatures; ``frames`` (T, 3): origin x, y and pitch; ``levels`` (L, 3): offset of the
+bounds, columns, shift, of all fields after each other; ``level_of[span]``: the level whose windows
+hold ``span + 1`` cells wherever they start; ``half_of[span]``: that of which two overlapping
+windows hold them exactly. ``heap`` holds every slot of ``boxes`` once: the open ones as a binary
+heap by ``keys``, behind them the free ones.
 
 A box is (theta, x, y, half theta, half x, half y). The motion is ``p = R(theta) x + t`` for a
 forward term and ``p = R(theta)^T (y - t)`` for an inverse one.
@@ -51,7 +51,7 @@ def _reach(cos, sin, tx, ty, h_x, h_y, swing, bow, is_inverse, x, y):
 
 
 @njit(cache=True, nogil=True)
-def bound_first(points, terms, frames, levels, level_of, bounds, box):
+def bound_first(points, terms, frames, levels, level_of, half_of, bounds, windows, box):
     """Upper bound over a box: every point at the best place that it can reach."""
     cos, sin = math.cos(box[0]), math.sin(box[0])
     swing = math.sin(box[3]) if box[3] < 0.5 * math.pi else 1.0
@@ -61,6 +61,7 @@ def bound_first(points, terms, frames, levels, level_of, bounds, box):
     for t in range(terms.shape[0]):
         is_inverse = terms[t, 2] != 0
         num_rows, num_cols, first_level = terms[t, 4], terms[t, 5], terms[t, 6]
+        at_windows = terms[t, 7]
         scale = 1.0 / frames[t, 2]
         shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
         for k in range(terms[t, 0], terms[t, 1]):
@@ -73,7 +74,13 @@ def bound_first(points, terms, frames, levels, level_of, bounds, box):
                 continue
             i0, j0 = int(max(u - eu, 0.0)), int(max(v - ev, 0.0))
             i1, j1 = int(min(u + eu, num_cols - 1.0)), int(min(v + ev, num_rows - 1.0))
-            row = first_level + level_of[max(i1 - i0, j1 - j0)]
+            span = max(i1 - i0, j1 - j0)
+            if span < half_of.shape[0]:
+                total += points[k, 2] * _largest(
+                    windows, at_windows, num_rows, num_cols, half_of, i0, j0, i1, j1
+                )
+                continue
+            row = first_level + level_of[span]
             shift = levels[row, 2]
             at = levels[row, 0] + (j0 >> shift) * levels[row, 1] + (i0 >> shift)
             total += points[k, 2] * bounds[at]
@@ -81,7 +88,7 @@ def bound_first(points, terms, frames, levels, level_of, bounds, box):
 
 
 @njit(cache=True, nogil=True)
-def _largest_curvature(curvatures, at, num_rows, num_cols, half_of, i0, j0, i1, j1):
+def _largest(windows, at, num_rows, num_cols, half_of, i0, j0, i1, j1):
     """Exact maximum over a rectangle of cells, from four overlapping windows."""
     level = half_of[max(i1 - i0, j1 - j0)]
     size = 1 << level
@@ -89,8 +96,8 @@ def _largest_curvature(curvatures, at, num_rows, num_cols, half_of, i0, j0, i1, 
     right, top = max(i1 - size + 1, i0), max(j1 - size + 1, j0)
     low, high = at + j0 * num_cols, at + top * num_cols
     return max(
-        max(curvatures[low + i0], curvatures[low + right]),
-        max(curvatures[high + i0], curvatures[high + right]),
+        max(windows[low + i0], windows[low + right]),
+        max(windows[high + i0], windows[high + right]),
     )
 
 
@@ -129,7 +136,7 @@ def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, 
             i1, j1 = int(min(u + eu, num_cols - 1.0)), int(min(v + ev, num_rows - 1.0))
             if max(i1 - i0, j1 - j0) >= half_of.shape[0]:
                 return
-            curvature = weight * _largest_curvature(
+            curvature = weight * _largest(
                 curvatures, at_curvatures, num_rows, num_cols, half_of, i0, j0, i1, j1
             )
             la += curvature
@@ -427,8 +434,9 @@ def _axis_to_split(child, arm, out):
 
 @njit(cache=True, nogil=True)
 def run(
-    points, terms, frames, levels, level_of, half_of, coefficients, bounds, curvatures, window,
-    arm, reach, margin, small, gap, keep, max_boxes, boxes, keys, heap, counters, best, found,
+    points, terms, frames, levels, level_of, half_of, coefficients, bounds, windows, curvatures,
+    window, arm, reach, margin, small, gap, keep, max_boxes,
+    boxes, keys, heap, counters, best, found,
 ):  # fmt: skip
     """Search until the gap is closed or `max_boxes` more boxes were bounded.
 
@@ -461,8 +469,10 @@ def run(
         centre = child[axis]
         for side in range(2):
             child[axis] = centre + (2 * side - 1) * child[axis + 3]
-            upper = bound_first(points, terms, frames, levels, level_of, bounds, child) + margin
-            upper = min(parent_key, upper)
+            upper = bound_first(
+                points, terms, frames, levels, level_of, half_of, bounds, windows, child
+            )
+            upper = min(parent_key, upper + margin)
             counters[NUM_BOXES] += 1
             out[0] = math.inf
             floor = min(best[0], keep * best[0])

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration.branch_and_bound import (
+    Problem,
     SearchOutcome,
     SearchSettings,
     Status,
@@ -35,6 +36,7 @@ from uw_dslam_ros2.core.registration.refine import (
     PointModel,
     Refinement,
     evaluate_pose,
+    polish,
     pose_evidence,
     refine,
 )
@@ -73,6 +75,7 @@ class _Cloud:
 class _Rung:
     """One search and the refined poses it led to, best evidence first."""
 
+    sigma_m: float
     terms: list[Term]
     outcome: SearchOutcome
     unit: float  # what a perfect match of all source weight scores
@@ -179,7 +182,32 @@ class _Match:
         """Search, refine, decide."""
         rungs = self._likelihood() if self._config.method == "likelihood" else self._gmrbnb()
         hypotheses = self._merged(rungs)
+        hypotheses[0] = self._polished(hypotheses[0])
+        if posterior([hypotheses[0][0]]) < self._config.min_probability:
+            hypotheses = self._distinct_from(self._guess(rungs), hypotheses)
         return self._packed(rungs[0], hypotheses, sum(r.outcome.num_boxes for r in rungs), start)
+
+    def _guess(self, rungs: list[_Rung]) -> tuple[float, Refinement]:
+        """Where nothing is certain: the optimum that stands out most among those of its kernel."""
+        margins = [self._margin(rung) for rung in rungs]
+        rung = rungs[int(np.argmax(margins))]
+        pose = rung.outcome.T_target_source
+        refinement = evaluate_pose(self._model, pose, rung.sigma_m)
+        return min(self._evidence(refinement), 0.0), refinement
+
+    def _margin(self, rung: _Rung) -> float:
+        best, *others = rung.outcome.optima
+        top = rung.outcome.T_target_source
+        for value, x, y, theta in others:
+            if self._is_apart(top, SE2(x, y, theta)):
+                return float(best[0] - value)
+        return float(best[0])
+
+    def _distinct_from(
+        self, first: tuple[float, Refinement], others: list[tuple[float, Refinement]]
+    ) -> list[tuple[float, Refinement]]:
+        pose = first[1].pose()
+        return [first, *(pair for pair in others if self._is_apart(pose, pair[1].pose()))]
 
     def _likelihood(self) -> list[_Rung]:
         """Rungs of the ladder, until one is decisive."""
@@ -213,7 +241,7 @@ class _Match:
         share = 1.0 - self._config.clutter_share
         n = len(self._target.points)
         terms = []
-        for points, weights, sigmas_m in self._classes(sigma_m):
+        for points, weights, sigmas_m in self._classes(sigma_m, self._source, self._target):
             width = float(np.sqrt(np.mean(sigmas_m**2)))
             contrast = share / (1.0 - share) * self._area_m2 / (n * 2.0 * math.pi * width**2)
             field = likelihood_field(
@@ -224,11 +252,12 @@ class _Match:
         unit = sum(float(term.weights.sum()) for term in terms)
         outcome = self._search(terms, "search", max_boxes)
         start = sigma_m if sigma_m is not None else width
-        return _Rung(terms, outcome, unit, 0.0, self._refined(outcome, start))
+        return _Rung(start, terms, outcome, unit, 0.0, self._refined(outcome, start))
 
-    def _classes(self, sigma_m: float | None) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    def _classes(
+        self, sigma_m: float | None, source: _Cloud, target: _Cloud
+    ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         """Source points of equal standard deviation, with that of their pairs (n,)."""
-        source, target = self._source, self._target
         n = len(target.points)
         if sigma_m is not None:
             return [(source.points, source.weights, np.full(n, sigma_m))]
@@ -299,6 +328,13 @@ class _Match:
         translation, rotation = a.distance_to(b)
         return translation + rotation * self._arm_m > 0.5 * self._spacing_m
 
+    def _polished(self, pair: tuple[float, Refinement]) -> tuple[float, Refinement]:
+        refinement = polish(self._model, pair[1])
+        if self._is_outside(refinement.pose()):
+            return pair
+        evidence = self._evidence(refinement)
+        return (evidence, refinement) if evidence >= pair[0] - 1.0 else pair
+
     def _merged(self, rungs: list[_Rung]) -> list[tuple[float, Refinement]]:
         return self._distinct([pair for rung in rungs for pair in rung.candidates])
 
@@ -326,21 +362,16 @@ class _Match:
         self, sigma_m: float | None, source: _Cloud, target: _Cloud, stage: str
     ) -> _Rung:
         terms, error = [], 0.0
-        for points, weights, sigmas_m in self._classes(sigma_m):
-            chosen = np.isin(points[:, 0], source.points[:, 0])
-            if not chosen.any():
-                continue
-            mask = np.isin(self._target.points[:, 0], target.points[:, 0])
+        for points, weights, sigmas_m in self._classes(sigma_m, source, target):
             field = mixture_field(
-                self._target.points[mask], self._target.weights[mask], sigmas_m[mask],
-                max_nodes=self._max_nodes(),
-            )  # fmt: skip
-            terms.append(Term(points[chosen], weights[chosen], field))
-            error += float(weights[chosen].sum()) * field.error
+                target.points, target.weights, sigmas_m, max_nodes=self._max_nodes()
+            )
+            terms.append(Term(points, weights, field))
+            error += float(weights.sum()) * field.error
         unit = sum(float(term.weights.sum()) for term in terms) * float(target.weights.max())
         outcome = self._search(terms, stage, self._config.max_boxes)
         width = sigma_m if sigma_m is not None else float(np.sqrt(np.mean(sigmas_m**2)))
-        return _Rung(terms, outcome, unit, error, self._refined(outcome, width))
+        return _Rung(width, terms, outcome, unit, error, self._refined(outcome, width))
 
     def _packed(
         self,
@@ -367,7 +398,6 @@ class _Match:
         if self._is_swapped:
             source_points, target_points = target_points, source_points
         is_inlier = _has_partner(pose.apply(source_points), target_points, best, self._spacing_m)
-        top = hypotheses[0][0]
         return RegistrationResult(
             verdict=verdict,
             reason=reason,
@@ -385,17 +415,25 @@ class _Match:
             inlier_ratio=float(is_inlier.mean()),
             num_source_points=len(source_points),
             num_target_points=len(target_points),
-            rivals=tuple(
-                Rival(
-                    self._full_pose(r.pose()),
-                    _share(e, top),
-                    outcome.upper_bound / max(outcome.lower_bound, 1e-300),
-                )
-                for e, r in hypotheses[1 : 1 + self._config.max_rivals]
-            ),
+            rivals=self._rivals(rung, hypotheses),
             source_points=source_points,
             target_points=target_points,
             is_inlier=is_inlier,
+        )
+
+    def _rivals(
+        self, rung: _Rung, hypotheses: list[tuple[float, Refinement]]
+    ) -> tuple[Rival, ...]:
+        """The other poses, scored as shares of the best one's objective."""
+        problem = Problem(rung.terms)
+        values = [problem.value_at(problem.from_pose(r.pose()))[0] for _, r in hypotheses]
+        best = max(values[0], 1e-300)
+        chosen = list(zip(hypotheses, values, strict=True))[1 : 1 + self._config.max_rivals]
+        return tuple(
+            Rival(
+                self._full_pose(r.pose()), max(value, 0.0) / best, rung.outcome.upper_bound / best
+            )
+            for (_, r), value in chosen
         )
 
     def _full_pose(self, pose: SE2) -> SE2:
@@ -489,10 +527,6 @@ def _has_partner(
     reach = max(3.0 * best.sigma_m, 1e-3 * spacing_m)
     distances, _ = cKDTree(target).query(moved)
     return np.asarray(distances <= reach)
-
-
-def _share(evidence: float, top: float) -> float:
-    return float(np.clip(evidence / top, 0.0, 1.0)) if top > 0.0 else 0.0
 
 
 def _too_few(

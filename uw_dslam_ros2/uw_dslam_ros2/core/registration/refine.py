@@ -18,9 +18,19 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.registration import refine_kernels
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["PointModel", "Refinement", "evaluate_pose", "pose_evidence", "procrustes", "refine"]
+__all__ = [
+    "PointModel",
+    "Refinement",
+    "evaluate_pose",
+    "polish",
+    "pose_evidence",
+    "procrustes",
+    "refine",
+]
 
 FloatArray = NDArray[np.float64]
+
+_FITTED = 4.0  # nats that choosing the best noise and share, and the best of many climbs, may win
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +100,7 @@ def refine(
     a quarter and so on of `sigma_m` in turn, each from where the last one ended; the one with the
     highest evidence, in the searched `volume`, wins.
     """
-    best = _climb(model, parameters, sigma_m, model.max_sigma_m, share, 60)
+    best = _climb(model, parameters, sigma_m, model.max_sigma_m, share, 30)
     best_evidence = pose_evidence(best, volume, usual_sigma_m)
     last = best
     for halving in range(1, num_halvings + 1):
@@ -99,11 +109,17 @@ def refine(
             continue
         if cap <= model.min_sigma_m:
             break
-        last = _climb(model, last.parameters, cap, cap, last.share, 30)
+        last = _climb(model, last.parameters, cap, cap, last.share, 15)
         evidence = pose_evidence(last, volume, usual_sigma_m)
         if evidence > best_evidence:
             best, best_evidence = last, evidence
     return best
+
+
+def polish(model: PointModel, refinement: Refinement) -> Refinement:
+    """Iterate to full precision from where `refine` ended."""
+    start = refinement.parameters, refinement.sigma_m, model.max_sigma_m, refinement.share
+    return _climb(model, *start, 100, 1e-9)
 
 
 def _climb(
@@ -113,12 +129,13 @@ def _climb(
     max_sigma_m: float,
     share: float,
     max_steps: int,
+    tolerance: float = 1e-3,
 ) -> Refinement:
     state = np.array([*parameters, sigma_m, share], dtype=np.float64)
     information = np.zeros((3, 3))
     value = refine_kernels.expectation_maximisation(
         model.source, model.source_weights, model.target, model.target_weights,
-        model.area_m2, model.min_sigma_m, max_sigma_m, state, max_steps, information,
+        model.area_m2, model.min_sigma_m, max_sigma_m, state, max_steps, tolerance, information,
     )  # fmt: skip
     return Refinement(
         state[:3],
@@ -148,7 +165,8 @@ def pose_evidence(refinement: Refinement, volume: float, usual_sigma_m: float) -
         return -math.inf
     log_width = 1.5 * math.log(2.0 * math.pi) - 0.5 * float(np.log(eigenvalues).sum())
     log_prior = min(3.0 * math.log(refinement.sigma_m / usual_sigma_m), 0.0)
-    return refinement.log_likelihood + min(log_width - math.log(volume), 0.0) + log_prior
+    log_share = min(log_width - math.log(volume), 0.0)
+    return refinement.log_likelihood + log_share + log_prior - _FITTED
 
 
 def procrustes(source: FloatArray, target: FloatArray, weights: FloatArray) -> SE2:

@@ -28,7 +28,7 @@ def _expect(source, source_weights, target, target_weights, area, state, partner
     """Likelihood; per source point the weight of its partner, the partner, and the spread."""
     theta, tx, ty, sigma, share = state[0], state[1], state[2], state[3], state[4]
     cos, sin = math.cos(theta), math.sin(theta)
-    cut = 5.0 * sigma
+    cut = 4.5 * sigma
     density = share * area / (target.shape[0] * 2.0 * math.pi * sigma * sigma)
     scale = -0.5 / (sigma * sigma)
     value = 0.0
@@ -63,7 +63,7 @@ def _expect(source, source_weights, target, target_weights, area, state, partner
 @njit(cache=True, nogil=True)
 def expectation_maximisation(
     source, source_weights, target, target_weights, area, min_sigma, max_sigma, state, max_steps,
-    information,
+    tolerance, information,
 ):  # fmt: skip
     """Iterate ``state`` (theta, x, y, sigma, share) in place; returns the log-likelihood ratio."""
     m = source.shape[0]
@@ -111,7 +111,7 @@ def expectation_maximisation(
         state[3] = min(max(sigma, min_sigma), max_sigma)
         state[4] = min(max(total / weight_sum, 1e-3), 0.98)
         value = _expect(source, source_weights, target, target_weights, area, state, partner)
-        if moved < 1e-7:
+        if moved < tolerance:
             break
     _observe(source, source_weights, target, target_weights, area, state, information)
     return value
@@ -122,7 +122,7 @@ def _observe(source, source_weights, target, target_weights, area, state, inform
     """Negative second derivatives of the likelihood in theta, x, y; partners are not certain."""
     theta, tx, ty, sigma, share = state[0], state[1], state[2], state[3], state[4]
     cos, sin = math.cos(theta), math.sin(theta)
-    cut = 5.0 * sigma
+    cut = 4.5 * sigma
     density = share * area / (target.shape[0] * 2.0 * math.pi * sigma * sigma)
     scale = 1.0 / (sigma * sigma)
     information[:, :] = 0.0
