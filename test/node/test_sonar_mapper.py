@@ -127,7 +127,8 @@ def mapper_of(context, namespace="auv_1", **settings):
     return SonarMapper(context=context, namespace=namespace, parameter_overrides=parameters)
 
 
-def finish(until, vehicle):
+def finish(until, vehicle, num_frames=1):
+    until(lambda: vehicle.values().get("num_frames") == str(num_frames), "the mount")
     until(vehicle.finish_client.service_is_ready, "the service")
     future = vehicle.finish_client.call_async(Trigger.Request())
     until(future.done, "the end of the mapping")
@@ -213,7 +214,7 @@ def test_unknown_frame_is_named(ros_context, spinning):
         for second in range(3):
             vehicle.send_second(second)
         until(lambda: vehicle.values().get("num_scan") == "6", "the scans")
-        assert "0 pings mapped" in finish(until, vehicle).message
+        assert "0 pings mapped" in finish(until, vehicle, num_frames=0).message
         until(lambda: "where auv_1/sonar is on auv_1/base_link" in vehicle.message(), "the name")
 
 

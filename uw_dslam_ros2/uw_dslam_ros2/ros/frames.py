@@ -37,9 +37,15 @@ class Mounts:
     ) -> None:
         self._node = node
         self._frames = StaticFrames()
+        self._names: set[str] = set()
         self._lock = threading.Lock()
         self._on_change = on_change
         node.create_subscription(TFMessage, "/tf_static", self._on_transforms, STATIC_TF, **kwargs)
+
+    @property
+    def num_frames(self) -> int:
+        """Frames that were told."""
+        return len(self._names)
 
     def _on_transforms(self, msg: TFMessage) -> None:
         for transform in msg.transforms:
@@ -57,6 +63,7 @@ class Mounts:
                 continue
             with self._lock:
                 self._frames.add(parent, child, T_parent_child)
+                self._names.add(child)
         if self._on_change is not None:
             self._on_change()
 

@@ -373,6 +373,7 @@ class SonarMapper(Node):
                     )
         values = {
             **dict(sorted(self._counts.items())),
+            "num_frames": self._mounts.num_frames,
             "num_late": self._order.num_late,
             "num_waiting": self._worker.num_waiting,
             **self._mapper_values,
