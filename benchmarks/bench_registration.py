@@ -37,8 +37,8 @@ from uw_dslam_ros2.core.registration.reference import (
 from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem
 
 _SIGMA_M = 0.1  # the paper's
-_NODES_PER_SIGMA = 8.0  # of the field's lattice; its error falls with the third power
-_SEARCH_SHARE = 0.85  # of the gap; the rest is for the field's error
+_NODES_PER_SIGMA = 5.0  # of the field's lattice; its error falls with the third power
+_SEARCH_SHARE = 0.5  # of the gap; the rest is for the field's error
 _PEERS = ["ICP, 36 starts", "correlative BnB", "pair voting"]
 _GO_ICP = "Go-ICP in SE(2)"
 

@@ -112,7 +112,8 @@ def _trace_engine(problem: PointSetProblem, args: argparse.Namespace) -> NDArray
         start = time.process_time()
         field = mixture_field(problem.target, np.full(num_target, weight), sigmas)
         term = Term(problem.source, np.ones(len(problem.source)), field)
-        found = search([term], SearchSettings(gap=args.engine_gap, max_boxes=limit))
+        # Half of the gap is left for the field's error.
+        found = search([term], SearchSettings(gap=0.5 * args.engine_gap, max_boxes=limit))
         seconds = time.process_time() - start
         # The field is the mixture to within a proven error, which belongs into the bounds.
         slack = field.error * len(problem.source)
