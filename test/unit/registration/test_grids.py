@@ -50,7 +50,7 @@ def _framed(occupancy: OccupancyMap, T_new_old: SE2) -> OccupancyMap:
 
 @pytest.fixture(scope="module")
 def harbour() -> MapPair:
-    return make_pair("harbour", 0.6, "noisy", 4)
+    return make_pair("harbour", 0.7, "noisy", 4, size_cells=180)
 
 
 @pytest.mark.parametrize("sides", [(True, False), (False, True)])
@@ -133,10 +133,10 @@ def test_the_papers_points_stay_selectable(harbour):
 
 
 def test_a_map_beyond_the_limit_is_refused_by_name(harbour):
-    config = GridRegistrationConfig(max_side_cells=200)
+    config = GridRegistrationConfig(max_side_cells=150)
     result = register_grids(harbour.source, harbour.target, config)
     assert not result.is_accepted
-    assert "260 x 260" in result.reason
+    assert "180 x 180" in result.reason
 
 
 def test_different_places_are_refused():

@@ -26,7 +26,7 @@ class GridRegistrationConfig(Config):
     finest_cells: int = setting(1000, 100, 4000, "longer side of a map in the refinement")
     max_side_cells: int = setting(8000, 100, 100000, "maps with a longer side are refused")
     gap: float = setting(0.1, 0.001, 0.5, "relative gap of the certificate")
-    max_boxes: int = setting(300_000, 1000, 1_000_000_000, "search boxes before giving up")
+    max_boxes: int = setting(1_500_000, 1000, 1_000_000_000, "search boxes before giving up")
     max_seconds: float = setting(20.0, 0.1, 3600.0, "time before giving up [s]; needs a clock")
     min_wall_cells: int = setting(25, 1, 100000, "fewer wall cells in a map are too few")
     min_overlap: float = setting(0.1, 0.0, 1.0, "least common seen area, share of the smaller")

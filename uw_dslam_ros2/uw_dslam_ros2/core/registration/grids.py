@@ -216,7 +216,8 @@ class _GridMatch:
         specs = (self._source.spec, self._target.spec)
         longest_m = max(max(spec.shape) * spec.resolution_m for spec in specs)
         coarser = max(spec.resolution_m for spec in specs)
-        return max(coarser, longest_m / self._config.finest_cells)
+        # A whole multiple, whose sums are quick.
+        return coarser * math.ceil(longest_m / coarser / self._config.finest_cells - 1e-9)
 
     def _levels(self, source: CellEvidence, target: CellEvidence) -> list[GridProblem]:
         """Problems from the searched lattice to the finest one."""
