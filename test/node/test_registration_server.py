@@ -297,7 +297,7 @@ def test_action_tells_the_bounds_at_least_twice_a_second(serve, gate):
     newest = arrivals[-1][1]
     assert (newest.stage, newest.lower_bound, newest.upper_bound) == ("search", 0.5, 0.9)
     assert newest.gap == pytest.approx(4 / 9)
-    assert newest.num_boxes > arrivals[0][1].num_boxes
+    assert newest.num_boxes > arrivals[1][1].num_boxes
     assert newest.seconds > 0.0
     assert newest.t_target_source.x == 1.0
 
@@ -309,7 +309,7 @@ def test_cancel_is_answered_with_the_best_so_far(serve, gate, is_obedient):
     feedback = []
     with serve() as (until, probe):
         client, handle = start_goal(until, probe, feedback.append)
-        until(lambda: feedback, "feedback")
+        until(lambda: feedback and feedback[-1].feedback.stage == "search", "feedback")
         done = handle.get_result_async()
         asked_s = time.monotonic()
         cancelled = handle.cancel_goal_async()
@@ -324,6 +324,28 @@ def test_cancel_is_answered_with_the_best_so_far(serve, gate, is_obedient):
         assert took_s < 1.0  # 0.1 s on an idle machine; tests run on busy ones
         gate.opened.set()
         client.destroy()
+
+
+def test_action_speaks_before_the_search_does(serve, monkeypatch):
+    """While features are made, nothing is proven: the bounds are 0 and 1, and there is no pose."""
+    opened = threading.Event()
+
+    def silent(*_, **__):
+        opened.wait(30.0)
+        return refused_registration("done")
+
+    monkeypatch.setattr(registration_server, "register_grids", silent)
+    feedback = []
+    with serve() as (until, probe):
+        client, handle = start_goal(until, probe, feedback.append)
+        until(lambda: len(feedback) >= 2, "feedback")
+        opened.set()
+        done = handle.get_result_async()
+        until(done.done, "the result")
+        client.destroy()
+    first = feedback[0].feedback
+    assert (first.stage, first.lower_bound, first.upper_bound, first.gap) == ("features", 0, 1, 1)
+    assert np.isnan(first.t_target_source.x)
 
 
 def test_goal_beyond_the_limit_is_aborted_with_the_reason(serve, gate):

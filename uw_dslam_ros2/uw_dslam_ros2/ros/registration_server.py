@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import socket
 import threading
@@ -19,6 +20,7 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from uw_dslam_msgs.action import RegisterMaps as RegisterMapsAction
+from uw_dslam_msgs.msg import Transform2D
 from uw_dslam_msgs.srv import RegisterMaps, RegisterPointSets
 
 from uw_dslam_ros2.core.config import Config
@@ -233,7 +235,7 @@ class RegistrationServer(Node):
                 job.cancel()
                 return True
             now_s = time.monotonic()
-            if job.newest is not None and now_s - sent_s >= _FEEDBACK_PERIOD_S:
+            if now_s - sent_s >= _FEEDBACK_PERIOD_S:
                 sent_s = now_s
                 goal.publish_feedback(_feedback(job.newest, now_s - job.begun_s))
         return bool(goal.is_cancel_requested)
@@ -267,7 +269,16 @@ def adapted[ConfigT: Config](config: ConfigT, max_seconds: float, **given: float
         raise InvalidInputError(f"the request asks for what cannot be: {error}") from error
 
 
-def _feedback(progress: Progress, seconds: float) -> RegisterMapsAction.Feedback:
+def _feedback(progress: Progress | None, seconds: float) -> RegisterMapsAction.Feedback:
+    if progress is None:  # before the search, nothing is proven and no pose is known
+        nowhere = Transform2D(x=math.nan, y=math.nan, yaw=math.nan)
+        return RegisterMapsAction.Feedback(
+            stage="features",
+            upper_bound=1.0,
+            gap=1.0,
+            seconds=float(seconds),
+            t_target_source=nowhere,
+        )
     return RegisterMapsAction.Feedback(
         stage=progress.stage,
         lower_bound=float(progress.lower_bound),
