@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
+from uw_dslam_ros2.core.registration.grid_warm_up import warm_up as warm_up_grids
 from uw_dslam_ros2.core.registration.pipeline import register_point_sets
 
 __all__ = ["warm_up"]
 
 
 def warm_up() -> None:
-    """Match a few points with every method."""
+    """Match a few points with every method, and two small maps."""
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (8, 2))
     for method in ("likelihood", "gmrbnb"):
         register_point_sets(points, points + 1.0, RegistrationConfig(method=method, gap=0.2))
+    warm_up_grids()
