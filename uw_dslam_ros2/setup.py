@@ -9,7 +9,7 @@ NAME = "uw_dslam_ros2"
 NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
 COMMANDS = ("simulate", "offline", "register", "evaluate", "study", "convert")
 
-# The settings live at the top of the repository; they are installed with the package when it is built from there.
+# The settings live at the top of the repository and are installed with the package built there.
 CONFIG = sorted(glob("../config/*.yaml")) if Path("../config").is_dir() else []
 
 setup(
