@@ -11,6 +11,7 @@ from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, SubmapState
+from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, lawnmower_fleet, refuse
 
@@ -317,3 +318,18 @@ def test_a_new_submap_redraws_only_what_it_touches():
     assert np.abs(centre - np.array(spec.shape) / 2).max() <= 2
     assert max(window.shape) <= 2 * FLEET.radius_m / spec.resolution_m + 4
     assert queue.changed_window() is None
+
+
+def test_answers_that_are_not_sure_enough_alone_join_where_they_all_agree():
+    """Refused each by itself; but right by chance, several times over, they cannot be."""
+
+    def unsure(request):
+        answer = KnowingMatcher(FLEET)(request)
+        if not answer.is_accepted:
+            return answer
+        return dataclasses.replace(answer, verdict=Verdict.NOT_ENOUGH_OVERLAP, probability=0.7)
+
+    queue = filled()
+    answer_all(queue, unsure)
+    assert {r.component for r in queue.submaps()} == {0}
+    assert FLEET.position_rmse_m(queue) < 0.2

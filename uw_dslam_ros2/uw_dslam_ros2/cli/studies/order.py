@@ -2,8 +2,9 @@
 
 Fleets of vehicles on neighbouring lanes, each with an unknown start and drifting odometry, are fed
 to the map queue in random orders of the vehicles: to the paper's plain queue (take two, register,
-put the merged map back) and to the pose graph. Registrations are the project's own; with
-``--matcher truth`` they come from the true poses with noise, and a share of them can be wrong.
+put the merged map back) and to the pose graph. So that the merging alone is compared, the
+registrations come from the true poses with noise, and a share of them can be wrong; with
+``--matcher grids`` they are the project's own.
 """
 
 from __future__ import annotations
@@ -37,11 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=5, help="default: %(default)s")
     parser.add_argument("--submaps", type=int, default=5, help="of each (default: %(default)s)")
+    parser.add_argument("--lane", type=float, default=12.0, help="distance of lanes [m]")
     parser.add_argument("--orders", type=int, default=8, help="per place (default: %(default)s)")
     parser.add_argument("--places", type=int, default=3, help="seeds (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the first place")
     parser.add_argument(
-        "--matcher", choices=("grids", "truth"), default="grids", help="default: %(default)s"
+        "--matcher", choices=("truth", "grids"), default="truth", help="default: %(default)s"
     )
     parser.add_argument(
         "--wrong", type=float, default=0.0, help="share of wrong answers (matcher truth only)"
@@ -55,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     matchers: dict[int, tuple[Fleet, Matcher]] = {}
     for seed, order in progress(trials, text="orders"):
         if seed not in matchers:
-            fleet = lawnmower_fleet(args.vehicles, args.submaps, seed)
+            fleet = lawnmower_fleet(args.vehicles, args.submaps, seed, lane_m=args.lane)
             matchers[seed] = fleet, _remembering(_matcher(args, fleet, seed))
         rows += [_trial(*matchers[seed], seed, order, mode) for mode in _MODES]
     write_csv(args.out / "order.csv", rows)

@@ -250,7 +250,9 @@ class _Planner:
         return key
 
     def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
-        return self._library.settle(self._anchor, joints, self._config.inlier_probability)
+        # One answer may serve several matches; it is one edge.
+        unique = list({joint.key: joint for joint in joints}.values())
+        return self._library.settle(self._anchor, unique, self._config.inlier_probability)
 
 
 def _component_of(components: Sequence[Component]) -> dict[SubmapId, int]:

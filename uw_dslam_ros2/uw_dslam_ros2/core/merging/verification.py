@@ -38,8 +38,10 @@ _PASS = 0.6
 """How often a check of a true match agrees with it."""
 _LEAST_CHANCE = 0.05
 """How often a check of a false match agrees with it at least: mistakes have common causes."""
-_ENOUGH_ODDS = 10.0
-"""A match is believed if its checks make it ten times as likely as not."""
+_ENOUGH_ODDS, _ODDS_BEYOND_DOUBT = 10.0, 1000.0
+"""A match is believed if its checks make it ten times as likely as not, or a thousand times where
+none of the answers was accepted by itself.
+"""
 _PRIOR_SIGMA = 3.0
 _PRIOR_SHARE = 0.1
 _PRIOR_RAD = 0.15
@@ -328,15 +330,13 @@ class Verifier:
         Every check that agrees with another vote speaks for it as much as such an agreement is
         unlikely by chance: the smaller the region of agreement is within the window that was
         searched, the more. A check that was refused for want of evidence votes too, and is
-        believed itself where agreement makes up for what it lacks; but nothing is believed without
-        an accepted answer.
+        believed itself where agreement makes up for what it lacks.
         """
         edges = [self._turned(vote.joint.edge, source, target) for vote in votes]
         weights = [vote.joint.probability for vote in votes]
         probability = self._config.inlier_probability
         clique = consistent_set(edges, weights, source, target, probability)
-        if not any(votes[index].is_accepted for index in clique):
-            return [], 0.0
+        has_accepted = any(votes[index].is_accepted for index in clique)
         believed: list[Joint] = []
         odds = (1.0 - _PASS) ** (num_checks - sum(votes[i].prior is not None for i in clique))
         for place, index in enumerate(clique):
@@ -353,6 +353,9 @@ class Verifier:
                     self._chance(edges, index, earlier, vote, source, target)
                     for earlier in clique[:place]
                 )
+        # Without an accepted answer among them, agreement has to be beyond doubt.
+        if not has_accepted and odds < _ODDS_BEYOND_DOUBT:
+            return [], 0.0
         return believed, odds
 
     def _chance(
