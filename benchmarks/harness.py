@@ -120,5 +120,5 @@ def _rounded(value: Any) -> float:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, float | np.floating):
-        return _rounded(value)
+        return _rounded(value) if np.isfinite(value) else None  # JSON knows no NaN
     return value.item() if isinstance(value, np.generic) else value
