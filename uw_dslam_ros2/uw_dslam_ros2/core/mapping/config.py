@@ -102,6 +102,12 @@ class VehicleMapperConfig(Config):
     submap: SubmapConfig = setting(SubmapConfig())
     match: MatchConfig = setting(MatchConfig())
     loop: LoopConfig = setting(LoopConfig())
+    settle_s: float = setting(
+        0.1,
+        0.0,
+        10.0,
+        "a ping waits until navigation is this far ahead, for messages out of order",
+    )
     max_wait_s: float = setting(
         0.5, 0.0, 60.0, "a ping waits this long for its navigation messages"
     )

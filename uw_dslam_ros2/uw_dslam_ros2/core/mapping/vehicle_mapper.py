@@ -253,7 +253,8 @@ class VehicleMapper:
             stamp_ns, _, detections, T_base_sonar = self._pending[0]
             newest_ns = max(item[0] for item in self._pending)
             navigation_ns = self._navigation.stamp_ns
-            is_ready = navigation_ns is not None and navigation_ns >= stamp_ns
+            settled_ns = stamp_ns + int(self._config.settle_s * 1e9)
+            is_ready = navigation_ns is not None and navigation_ns >= settled_ns
             has_waited = newest_ns - stamp_ns > self._config.max_wait_s * 1e9
             if not (is_ready or has_waited or flush):
                 break

@@ -1,0 +1,193 @@
+"""Occupancy grids: the sensor model against a slow one, sums in any order, growth on a lattice."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.mapping.config import OccupancyConfig
+from uw_dslam_ros2.core.mapping.grid_kernels import beam_table, diamond
+from uw_dslam_ros2.core.mapping.occupancy import UNITS_PER_NAT, GrowingGrid, fuse
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar import Detections
+
+CONFIG = OccupancyConfig(resolution_m=0.1, free_range_max_m=8.0)
+
+
+def ping(ranges, bearings, beamwidth=0.05, weight=1.0, stamp_ns=0):
+    ranges, bearings = np.asarray(ranges, float), np.asarray(bearings, float)
+    is_echo = np.isfinite(ranges)
+    r, b = ranges[is_echo], bearings[is_echo]
+    points = np.column_stack([r * np.cos(b), r * np.sin(b)])
+    free = np.where(is_echo, ranges, 3.0)
+    return Detections(
+        stamp_ns, points, np.full(len(points), weight), bearings, free, beamwidth, 0.03
+    )
+
+
+def random_ping(rng):
+    bearings = np.linspace(-0.9, 0.9, 37)
+    ranges = rng.uniform(1.5, 7.0, 37)
+    ranges[rng.random(37) < 0.2] = np.inf
+    return ping(ranges, bearings, weight=rng.uniform(0.2, 1.0))
+
+
+def evidence_at(grid, x, y):
+    part = grid.trimmed()
+    row = math.floor(y / part.resolution_m) - part.row
+    col = math.floor(x / part.resolution_m) - part.col
+    if not (0 <= row < part.evidence.shape[0] and 0 <= col < part.evidence.shape[1]):
+        return None
+    return part.evidence[row, col] / UNITS_PER_NAT if part.observed[row, col] else None
+
+
+def test_target_to_port_is_mapped_to_port():
+    grid = GrowingGrid(CONFIG)
+    # The vehicle looks north; 5 m away, 30 degrees to port, is north-west.
+    grid.add(ping([5.0], [math.pi / 6]), SE2(10.0, 20.0, math.pi / 2))
+    x, y = 10.0 - 2.5, 20.0 + 4.330127
+    assert evidence_at(grid, x, y) == pytest.approx(CONFIG.hit_log_odds, abs=0.001)
+    assert evidence_at(grid, 10.0 - 1.25, 20.0 + 2.165) == pytest.approx(-CONFIG.free_log_odds)
+    assert evidence_at(grid, 10.0 + 2.5, y) is None
+    beyond = 6.0 / 5.0
+    assert evidence_at(grid, 10.0 - 2.5 * beyond, 20.0 + 4.33 * beyond) is None
+
+
+def test_free_water_is_what_the_obvious_loop_says(rng):
+    pose = SE2(1.3, -0.7, 0.6)
+    bearings = np.sort(rng.uniform(-1.0, 1.0, 25))
+    found = ping(np.full(25, np.inf), bearings, beamwidth=0.08)
+    grid = GrowingGrid(CONFIG)
+    grid.add(found, pose)
+    wrong = checked = 0
+    for x, y in itertools.product(np.arange(-3.95, 6.0, 0.1), repeat=2):
+        lx, ly = pose.inverse().apply([x, y])
+        away = np.abs(bearings - math.atan2(ly, lx))
+        margin = abs(away.min() - 0.75 * 0.08), abs(math.hypot(lx, ly) - (3.0 - 0.15))
+        if min(margin) < 2e-3:  # on the edge, where the table's steps decide
+            continue
+        is_free = away.min() < 0.75 * 0.08 and math.hypot(lx, ly) < 3.0 - 0.15
+        checked += 1
+        wrong += (evidence_at_fast(grid, x, y) is not None) != is_free
+    assert checked > 9000
+    assert wrong == 0
+
+
+def evidence_at_fast(grid, x, y, cache={}):  # noqa: B006 (a cache)
+    if cache.get("grid") is not grid:
+        cache.clear()
+        cache.update(grid=grid, part=grid.trimmed())
+    part = cache["part"]
+    row = math.floor(y / part.resolution_m) - part.row
+    col = math.floor(x / part.resolution_m) - part.col
+    inside = 0 <= row < part.evidence.shape[0] and 0 <= col < part.evidence.shape[1]
+    return True if inside and part.observed[row, col] else None
+
+
+def test_diamond_angle_rises_with_the_angle():
+    angles = np.linspace(-math.pi + 1e-6, math.pi - 1e-6, 5000)
+    values = np.array([diamond(math.cos(a), math.sin(a)) for a in angles])
+    assert (np.diff(values) > 0.0).all()
+    assert values.min() >= -2.0
+    assert values.max() <= 2.0
+
+
+def test_beams_behind_the_sonar_have_their_directions():
+    table = beam_table(np.array([math.pi - 0.01, 0.0]), 0.05, 4096)
+
+    def slot(angle):
+        return table[min(4095, int((diamond(math.cos(angle), math.sin(angle)) + 2.0) * 1024))]
+
+    assert slot(math.pi - 0.03) == 0
+    assert slot(-math.pi + 0.02) == 0  # across the seam
+    assert slot(0.02) == 1
+    assert slot(1.0) == -1
+
+
+def test_order_of_pings_does_not_matter(rng):
+    pings = [(random_ping(rng), SE2(*rng.uniform(-2, 2, 3))) for _ in range(8)]
+    grids = []
+    for order in (range(8), reversed(range(8)), rng.permutation(8)):
+        grid = GrowingGrid(CONFIG)
+        for i in order:
+            grid.add(*pings[i])
+        grids.append(grid.trimmed())
+    for other in grids[1:]:
+        assert (grids[0].row, grids[0].col) == (other.row, other.col)
+        np.testing.assert_array_equal(grids[0].evidence, other.evidence)
+        np.testing.assert_array_equal(grids[0].observed, other.observed)
+
+
+def test_growth_moves_no_cell(rng):
+    near, far = random_ping(rng), random_ping(rng)
+    grid = GrowingGrid(CONFIG)
+    grid.add(near, SE2())
+    before = grid.trimmed()
+    grid.add(far, SE2(-200.0, 300.0, 1.0))
+    after = grid.trimmed()
+    rows = slice(before.row - after.row, before.row - after.row + before.evidence.shape[0])
+    cols = slice(before.col - after.col, before.col - after.col + before.evidence.shape[1])
+    np.testing.assert_array_equal(after.evidence[rows, cols], before.evidence)
+    spec = after.to_occupancy(4.0).spec
+    for value in (spec.T_frame_grid.x, spec.T_frame_grid.y):
+        assert value / 0.1 == pytest.approx(round(value / 0.1), abs=1e-9)
+
+
+def test_one_ping_counts_once_in_a_cell():
+    # Twenty beams cross the cells near the sonar, and two echoes share a cell.
+    grid = GrowingGrid(CONFIG)
+    grid.add(ping(np.full(21, 2.0), np.linspace(-0.01, 0.01, 21), beamwidth=0.02), SE2(0, 0.05, 0))
+    part = grid.trimmed()
+    assert part.evidence.min() == -round(CONFIG.free_log_odds * UNITS_PER_NAT)
+    assert part.evidence.max() <= round(CONFIG.hit_log_odds * UNITS_PER_NAT)
+
+
+def test_weak_echo_stays_weak():
+    strong, weak = GrowingGrid(CONFIG), GrowingGrid(CONFIG)
+    strong.add(ping([3.0], [0.0], weight=1.0), SE2())
+    weak.add(ping([3.0], [0.0], weight=0.2), SE2())
+    assert evidence_at(weak, 3.0, 0.0) == pytest.approx(
+        0.2 * evidence_at(strong, 3.0, 0.0), abs=2e-3
+    )
+
+
+def test_packing_loses_nothing(rng):
+    grid = GrowingGrid(CONFIG)
+    grid.add(random_ping(rng), SE2(3.0, 4.0, 1.0))
+    part = grid.trimmed()
+    again = part.packed().unpacked()
+    np.testing.assert_array_equal(part.evidence, again.evidence)
+    np.testing.assert_array_equal(part.observed, again.observed)
+    assert (part.row, part.col) == (again.row, again.col)
+
+
+def test_percent_is_the_logistic_function():
+    grid = GrowingGrid(CONFIG)
+    for _ in range(3):
+        grid.add(ping([3.05], [0.0]), SE2())
+    found = grid.trimmed().to_occupancy(4.0)
+    cell = found.spec.cells_of([[3.05, 0.001]])[0]
+    p = 1.0 / (1.0 + math.exp(-3 * CONFIG.hit_log_odds))
+    assert found.values[tuple(cell)] == round(100 * p)
+    assert (found.values == -1).any()
+
+
+def test_fusing_at_identity_gives_the_same_map_and_order_does_not_matter(rng):
+    parts = []
+    for _ in range(3):
+        grid = GrowingGrid(CONFIG)
+        grid.add(random_ping(rng), SE2(*rng.uniform(-1, 1, 3)))
+        parts.append((grid.trimmed(), SE2(*rng.uniform(-3, 3, 3))))
+    alone = fuse([(parts[0][0], SE2())], 4.0)
+    direct = parts[0][0].to_occupancy(4.0)
+    known = alone.values[alone.values >= 0]
+    assert sorted(known) == sorted(direct.values[direct.values >= 0])
+    for order in itertools.permutations(parts):
+        np.testing.assert_array_equal(fuse(order, 4.0).values, fuse(parts, 4.0).values)
+
+
+def test_nothing_to_fuse_is_an_error():
+    with pytest.raises(InvalidInputError, match="no grid"):
+        fuse([], 4.0)

@@ -1,0 +1,256 @@
+"""The whole mapper on a small simulated place: messages in, submaps out."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.mapping import (
+    OccupancyConfig,
+    SubmapConfig,
+    VehicleMapper,
+    VehicleMapperConfig,
+)
+from uw_dslam_ros2.core.navigation import NavigationConfig
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar import SonarConfig
+
+S = 1_000_000_000
+SONAR = SE2(0.3, 0.0, 0.0)
+CONFIG = VehicleMapperConfig(
+    sonar=SonarConfig(neighbor_distance_m=0.0),
+    navigation=NavigationConfig(velocity_scale_sigma=0.1),
+    occupancy=OccupancyConfig(resolution_m=0.2),
+    submap=SubmapConfig(max_length_m=10.0),
+)
+# A basin with two jetties, as segments.
+SEGMENTS = np.array(
+    [
+        [0, 0, 40, 0], [40, 0, 40, 30], [40, 30, 0, 30], [0, 30, 0, 0],
+        [12, 0, 12, 9], [27, 30, 27, 20], [20, 13, 23, 15],
+    ],
+    float,
+)  # fmt: skip
+
+
+def scan(pose, bearings):
+    """Ranges to the first segment along each bearing; infinity where there is none."""
+    origin = np.array([pose.x, pose.y])
+    ranges = np.full(len(bearings), np.inf)
+    for i, b in enumerate(bearings):
+        d = np.array([math.cos(pose.yaw + b), math.sin(pose.yaw + b)])
+        for x1, y1, x2, y2 in SEGMENTS:
+            a, e = np.array([x1, y1]), np.array([x2 - x1, y2 - y1])
+            cross = d[0] * e[1] - d[1] * e[0]
+            if abs(cross) < 1e-12:
+                continue
+            r = a - origin
+            t, u = (r[0] * e[1] - r[1] * e[0]) / cross, (r[0] * d[1] - r[1] * d[0]) / cross
+            if t > 0 and 0 <= u <= 1:
+                ranges[i] = min(ranges[i], t)
+    return ranges
+
+
+def mission(duration_s=120, scale=1.08, seed=0):
+    """Events of a vehicle that circles twice; its velocity sensor reads 8 % too much."""
+    rng = np.random.default_rng(seed)
+    bearings = np.linspace(-1.1, 1.1, 90)
+    events, truth = [], []
+    for i in range(duration_s * 10 + 1):
+        t, angle = i * S // 10, 2 * math.pi * i / (duration_s * 5)
+        pose = SE2(19.5 + 6.5 * math.cos(angle), 15 + 6.5 * math.sin(angle), angle + math.pi / 2)
+        speed = 6.5 * 2 * math.pi / (duration_s / 2)
+        events.append(("yaw", t, pose.yaw + rng.normal(0, 0.01)))
+        events.append(("velocity", t, (scale * speed + rng.normal(0, 0.02), rng.normal(0, 0.02))))
+        if i % 10 == 5:
+            ranges = scan(pose @ SONAR, bearings)
+            events.append(("scan", t, (bearings, ranges + rng.normal(0, 0.03, len(ranges)))))
+            truth.append(pose.as_array())
+    return events, np.array(truth)
+
+
+def run(config, events):
+    mapper, submaps = VehicleMapper(config, "auv_1"), []
+    for kind, t, value in events:
+        if kind == "yaw":
+            submaps += mapper.add_imu(t, value, None)
+        elif kind == "velocity":
+            submaps += mapper.add_velocity(t, value)
+        else:
+            submaps += mapper.add_scan(t, *value, 30.0, SONAR)
+    return mapper, submaps + mapper.finish()
+
+
+def error_m(mapper, truth):
+    """Position error (K,) after the best rigid alignment."""
+    a, b = mapper.trajectory()[1][:, :2], truth[:, :2]
+    a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
+    cross = a0[:, 0] @ b0[:, 1] - a0[:, 1] @ b0[:, 0]
+    turn = SE2(0.0, 0.0, math.atan2(cross, (a0 * b0).sum()))
+    return np.linalg.norm(turn.apply(a0) - b0, axis=1)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return mission()
+
+
+@pytest.fixture(scope="module")
+def mapped(recording):
+    return run(CONFIG, recording[0])
+
+
+def test_matching_and_loops_beat_dead_reckoning(recording, mapped):
+    events, truth = recording
+    blind, _ = run(replace(CONFIG, estimator="dead_reckoning"), events)
+    # The circle of 6.5 m comes out 8 % too large.
+    assert np.mean(error_m(blind, truth)) > 0.4
+    assert np.mean(error_m(mapped[0], truth)) < 0.3 * np.mean(error_m(blind, truth))
+
+
+def test_submaps_count_up_and_revise_only_themselves(mapped):
+    mapper, submaps = mapped
+    sequences = [s.sequence for s in submaps]
+    assert sorted(set(sequences)) == list(range(max(sequences) + 1))
+    for sequence in set(sequences):
+        revisions = [s.revision for s in submaps if s.sequence == sequence]
+        assert revisions == sorted(set(revisions))
+        grids = [s.grid.values.tobytes() for s in submaps if s.sequence == sequence]
+        assert len(set(grids)) == 1  # rigid: only the pose is revised
+    assert mapper.diagnostics()["num_submaps"] == max(sequences) + 1
+
+
+def test_every_ping_is_in_exactly_one_submap(recording, mapped):
+    mapper, submaps = mapped
+    newest = {s.sequence: s for s in submaps}
+    stamps = np.concatenate([newest[k].trajectory_stamp_ns for k in sorted(newest)])
+    pings = [t for kind, t, _ in recording[0] if kind == "scan"]
+    assert stamps.tolist() == pings
+    assert mapper.trajectory()[0].tolist() == pings
+
+
+def test_submaps_hold_the_trajectory(mapped):
+    mapper, submaps = mapped
+    newest = {s.sequence: s for s in submaps}
+    placed = np.vstack([
+        newest[k].T_odom_submap.apply(newest[k].trajectory[:, :2]) for k in sorted(newest)
+    ])  # fmt: skip
+    # A pose that moves by less than 2 cm is not worth a revision.
+    np.testing.assert_allclose(placed, mapper.trajectory()[1][:, :2], atol=0.03)
+    first = newest[0].trajectory[0]
+    np.testing.assert_allclose(first, 0.0, atol=1e-9)
+
+
+def test_same_messages_same_bytes(recording, mapped):
+    again, submaps = run(CONFIG, recording[0])
+    assert again.trajectory()[1].tobytes() == mapped[0].trajectory()[1].tobytes()
+    assert [s.grid.values.tobytes() for s in submaps] == [
+        s.grid.values.tobytes() for s in mapped[1]
+    ]
+
+
+def test_small_delays_change_nothing(recording, mapped):
+    events, _ = recording
+    rng = np.random.default_rng(4)
+    # Pings come late by up to 0.3 s, navigation by up to 0.05 s.
+    arrival = [
+        t + rng.integers(0, 3 * S // 10 if kind == "scan" else S // 20) for kind, t, _ in events
+    ]
+    shuffled, _ = run(CONFIG, [events[i] for i in np.argsort(arrival, kind="stable")])
+    np.testing.assert_array_equal(shuffled.trajectory()[1], mapped[0].trajectory()[1])
+
+
+def test_a_ping_sent_twice_counts_once(recording, mapped):
+    events, _ = recording
+    doubled = [e for event in events for e in ([event] * (2 if event[0] == "scan" else 1))]
+    mapper, submaps = run(CONFIG, doubled)
+    assert submaps[-1].grid.values.tobytes() == mapped[1][-1].grid.values.tobytes()
+    assert mapper.diagnostics()["num_pings_dropped"] == sum(e[0] == "scan" for e in events)
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"),
+    [
+        (SubmapConfig(max_length_m=20.0, max_duration_s=1e5, max_sigma_m=1e3), 4),
+        (SubmapConfig(max_length_m=1e4, max_duration_s=30.0, max_sigma_m=1e3), 4),
+        (SubmapConfig(max_length_m=1e4, max_duration_s=1e5, max_sigma_m=1e3), 1),
+    ],
+    ids=["length", "time", "never"],
+)
+def test_closing_rules(recording, rule, expected):
+    # 120 s and 82 m of way, on paper; 8 % more by the sensor.
+    blind = replace(CONFIG, estimator="dead_reckoning", submap=rule)
+    _, submaps = run(blind, recording[0])
+    assert abs(len({s.sequence for s in submaps}) - expected) <= 1
+
+
+def test_uncertainty_closes_a_submap_too(recording):
+    loose, tight = (
+        len({
+            s.sequence
+            for s in run(
+                replace(
+                    CONFIG,
+                    estimator="dead_reckoning",
+                    submap=SubmapConfig(max_length_m=1e4, max_duration_s=1e5, max_sigma_m=sigma),
+                ),
+                recording[0],
+            )[1]
+        })
+        for sigma in (1e3, 0.5)
+    )  # fmt: skip
+    assert loose == 1
+    assert tight > 3
+
+
+def test_walls_are_where_they_are(recording, mapped):
+    mapper, _ = mapped
+    _, truth = recording
+    found = mapper.vehicle_map()
+    _, poses = mapper.trajectory()
+    T_truth_odom = SE2.from_array(truth[0]) @ SE2.from_array(poses[0]).inverse()
+    walls = T_truth_odom.apply(found.spec.centers_of(np.argwhere(found.values > 70)))
+    a, b = SEGMENTS[:, :2], SEGMENTS[:, 2:]
+    along = b - a
+    t = np.einsum("nsk,sk->ns", walls[:, None] - a, along) / (along**2).sum(axis=1)
+    nearest = a + np.clip(t, 0, 1)[..., None] * along
+    distance = np.linalg.norm(walls[:, None] - nearest, axis=2).min(axis=1)
+    assert len(walls) > 300
+    assert np.quantile(distance, 0.9) < 0.5
+
+
+def test_before_anything_there_is_no_pose_and_no_map():
+    mapper = VehicleMapper(CONFIG, "auv_1")
+    with pytest.raises(InvalidInputError, match="no pose"):
+        _ = mapper.T_odom_base
+    with pytest.raises(InvalidInputError, match="no map"):
+        mapper.vehicle_map()
+    assert mapper.finish() == []
+
+
+def test_pings_without_navigation_are_counted_not_placed():
+    mapper = VehicleMapper(CONFIG, "auv_1")
+    for i in range(10):
+        mapper.add_points(i * S, [[5.0, 0.0]], SONAR)
+    assert mapper.finish() == []
+    assert mapper.diagnostics()["num_pings_dropped"] == 10
+
+
+def test_empty_pings_make_an_empty_but_valid_submap():
+    mapper = VehicleMapper(CONFIG, "auv_1")
+    submaps = []
+    for i in range(20):
+        mapper.add_imu(i * S, 0.0, 0.0)
+        mapper.add_velocity(i * S, (0.1, 0.0))
+        submaps += mapper.add_points(i * S, np.empty((0, 2)), SONAR)
+    submaps += mapper.finish()
+    assert len(submaps) == 1
+    assert (submaps[0].grid.values == -1).all()
+    assert len(submaps[0].trajectory) == 20
+
+
+def test_a_vehicle_needs_a_name():
+    with pytest.raises(InvalidInputError, match="vehicle_id"):
+        VehicleMapper(CONFIG, "")
