@@ -20,6 +20,7 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
+from PIL import Image
 
 from uw_dslam_ros2.cli.outcome import Outcome, Trajectory
 from uw_dslam_ros2.cli.scoring import Scores, Truth
@@ -56,13 +57,16 @@ def vehicle_colors(vehicles: Sequence[str]) -> dict[str, str]:
 
 def png_bytes(figure: Figure, dpi: int = 110) -> bytes:
     """Encode a figure; the same figure gives the same bytes."""
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(dpi)
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    # Pictures of maps have few colours: with a palette they are a third of the size.
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
-    # Pictures of maps have few colours: a palette makes them a third of the size.
-    pixels = cv2.imdecode(np.frombuffer(buffer.getvalue(), np.uint8), cv2.IMREAD_COLOR)
-    is_done, encoded = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    assert is_done
-    return encoded.tobytes()
+    picture.quantize(192, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(
+        buffer, "PNG", optimize=True
+    )
+    return buffer.getvalue()
 
 
 def before_after(outcome: Outcome, title: str) -> Figure:
@@ -419,7 +423,7 @@ def _draw_seam(axes: Axes, grid: OccupancyMap, T_map_submap: SE2, color: str) ->
             continue
         cells = contour[:, 0, ::-1] * factor
         points = T_map_submap.apply(grid.spec.centers_of(np.vstack([cells, cells[:1]])))
-        axes.plot(points[:, 0], points[:, 1], color=color, lw=0.9, ls=(0, (1, 1.8)), alpha=0.75)
+        axes.plot(points[:, 0], points[:, 1], color=color, lw=0.9, ls=(0, (1, 1.8)), alpha=0.6)
 
 
 def _scale_bar(axes: Axes) -> None:
