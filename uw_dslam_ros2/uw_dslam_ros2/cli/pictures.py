@@ -176,14 +176,12 @@ def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str]) -> Non
         axes.set_axis_off()
         return
     _show_map(axes, outcome.global_map)
-    for record in outcome.records:
-        if record.state is SubmapState.MERGED:
-            _draw_seam(
-                axes,
-                record.submap.grid,
-                record.T_component_submap,
-                colors[record.submap.vehicle_id],
-            )
+    shown = [record for record in outcome.records if record.state is SubmapState.MERGED]
+    # Many seams must not hide the map.
+    opacity = min(0.6, max(0.2, 12.0 / max(1, len(shown))))
+    for record in shown:
+        color = colors[record.submap.vehicle_id]
+        _draw_seam(axes, record.submap.grid, record.T_component_submap, color, opacity)
     handles: list[Any] = []
     for vehicle in merged:
         if vehicle.trajectory is not None:
@@ -411,7 +409,9 @@ def _draw_way(axes: Axes, trajectory: Trajectory, color: str) -> None:
         axes.plot(*place[:2], mark, color=color, mec="white", mew=1.0, ms=7, clip_on=False)
 
 
-def _draw_seam(axes: Axes, grid: OccupancyMap, T_map_submap: SE2, color: str) -> None:
+def _draw_seam(
+    axes: Axes, grid: OccupancyMap, T_map_submap: SE2, color: str, opacity: float
+) -> None:
     factor = max(1, max(grid.spec.shape) // 300)
     # Shadows within, and single beams at the rim of what a submap has seen, are no seams.
     known = grid.known[::factor, ::factor].astype(np.uint8)
@@ -423,7 +423,7 @@ def _draw_seam(axes: Axes, grid: OccupancyMap, T_map_submap: SE2, color: str) ->
             continue
         cells = contour[:, 0, ::-1] * factor
         points = T_map_submap.apply(grid.spec.centers_of(np.vstack([cells, cells[:1]])))
-        axes.plot(points[:, 0], points[:, 1], color=color, lw=0.9, ls=(0, (1, 1.8)), alpha=0.6)
+        axes.plot(points[:, 0], points[:, 1], color=color, lw=0.9, ls=(0, (1, 1.8)), alpha=opacity)
 
 
 def _scale_bar(axes: Axes) -> None:
