@@ -182,8 +182,12 @@ class RegistrationServer(Node):
         source = self._points_of(request.source, "source")
         target = self._points_of(request.target, "target")
         given: dict[str, float] = {}
-        if request.sigma_m != 0.0:
-            given["sigma_m"] = float(request.sigma_m)
+        if not (math.isfinite(request.sigma_m) and request.sigma_m >= 0.0):
+            raise InvalidInputError(
+                f"sigma_m is {request.sigma_m}, expected a positive number, or 0 to derive it"
+            )
+        if request.sigma_m > 0.0:
+            given["sigma"] = float(request.sigma_m)
         config = adapted(self._point_config, max_seconds, **given)
         return functools.partial(
             register_point_sets, source, target, config, prior=prior, clock=time.monotonic

@@ -187,7 +187,7 @@ def _methods(cell: Cell) -> dict[str, Method]:
     share = 1.0 if cell.common_share is None else cell.common_share
     methods: dict[str, Method] = {
         ENGINE: _engine(RegistrationConfig()),
-        PAPER: _engine(RegistrationConfig(method="gmrbnb", sigma_m=0.1)),
+        PAPER: _engine(RegistrationConfig(method="gmrbnb", sigma=0.1)),
         ORACLE: _oracle,
         TRUTH: _from_truth,
     }

@@ -160,7 +160,7 @@ def _errors(log: LaserLog, first: int, args: argparse.Namespace) -> list[dict[st
         target,
         RegistrationConfig(
             method="gmrbnb",
-            sigma_m=args.sigma,
+            sigma=args.sigma,
             nnde_neighbors=args.neighbors,
             nnde_threshold=args.threshold,
         ),

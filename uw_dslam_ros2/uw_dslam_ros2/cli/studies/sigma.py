@@ -72,7 +72,7 @@ def _cell(cell: Cell, seeds: Sequence[int]) -> list[dict[str, Any]]:
     factors = sorted([*_FACTORS, paper_factor])
     for factor in progress([*factors, None], text=str(cell)):
         sigma_m = 0.0 if factor is None else factor * spacing_m / math.sqrt(2.0)
-        config = RegistrationConfig(sigma_m=sigma_m, max_boxes=_MAX_BOXES)
+        config = RegistrationConfig(sigma=sigma_m, max_boxes=_MAX_BOXES)
         plain, near, chain = [], [], []
         for problem in problems:
             source, target, T_true = problem.source, problem.target, problem.T_target_source

@@ -21,7 +21,7 @@ class RegistrationConfig(Config):
     method: str = setting(
         "likelihood", choices=("likelihood", "gmrbnb"), doc="objective that is searched"
     )
-    sigma_m: float = setting(
+    sigma: float = setting(
         0.0, 0.0, 1.0e4, "standard deviation of each point's Gaussian [m]; 0: derived from spacing"
     )
     gap: float = setting(0.01, 1.0e-6, 0.9, "relative gap between the bounds to prove")

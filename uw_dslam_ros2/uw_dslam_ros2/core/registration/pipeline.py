@@ -108,7 +108,7 @@ def register_point_sets(
     source_weights, target_weights : (m,), (n,)
         Mixture weights > 0; equal without.
     source_sigma_m, target_sigma_m : (m,), (n,)
-        Standard deviation of each point [m], > 0; ``config.sigma_m`` without.
+        Standard deviation of each point [m], > 0; ``config.sigma`` without.
     prior : PriorWindow
         Search only there.
     clock : callable
@@ -224,8 +224,8 @@ class _Match:
     def _ladder(self) -> Sequence[float | None]:
         if self._source.sigmas_m is not None or self._target.sigmas_m is not None:
             return (None,)
-        if self._config.sigma_m > 0.0:
-            return (math.sqrt(2.0) * self._config.sigma_m,)
+        if self._config.sigma > 0.0:
+            return (math.sqrt(2.0) * self._config.sigma,)
         return tuple(step * self._spacing_m for step in _LADDER)
 
     def _settings(self, max_boxes: int) -> SearchSettings:
@@ -261,7 +261,7 @@ class _Match:
         n = len(target.points)
         if sigma_m is not None:
             return [(source.points, source.weights, np.full(n, sigma_m))]
-        own = self._config.sigma_m or 0.5 * self._spacing_m / math.sqrt(2.0)
+        own = self._config.sigma or 0.5 * self._spacing_m / math.sqrt(2.0)
         first = (
             source.sigmas_m if source.sigmas_m is not None else np.full(len(source.points), own)
         )
@@ -340,7 +340,7 @@ class _Match:
 
     def _gmrbnb(self) -> list[_Rung]:
         """The paper's two passes."""
-        own = self._config.sigma_m or 0.5 * self._spacing_m / math.sqrt(2.0)
+        own = self._config.sigma or 0.5 * self._spacing_m / math.sqrt(2.0)
         sigma_m = None if self._ladder() == (None,) else math.sqrt(2.0) * own
         rung = self._mixture_rung(sigma_m, self._source, self._target, "search")
         moved = rung.outcome.T_target_source.apply(self._source.points)
