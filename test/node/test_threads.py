@@ -1,6 +1,7 @@
 """What the nodes' threads are made of: the worker, the jobs, the pacer."""
 
 import threading
+import time
 
 import pytest
 
@@ -38,13 +39,20 @@ def test_worker_survives_a_bad_job_and_tells():
 
 
 def test_closing_worker_cancels_what_waits():
-    worker, gate = Worker("test", print), threading.Event()
-    running = worker.call(lambda: gate.wait(PATIENCE_S))
+    worker, begun, gate = Worker("test", print), threading.Event(), threading.Event()
+
+    def job():
+        begun.set()
+        return gate.wait(PATIENCE_S)
+
+    running = worker.call(job)
     waiting = worker.call(lambda: "never")
+    assert begun.wait(PATIENCE_S)
     closer = threading.Thread(target=worker.close)
     closer.start()
+    deadline_s = time.monotonic() + PATIENCE_S
     while worker.num_waiting < 2:  # the job, and the word that it is over
-        pass
+        assert time.monotonic() < deadline_s
     gate.set()
     closer.join(PATIENCE_S)
     assert running.result(PATIENCE_S)

@@ -43,6 +43,7 @@ _FINISH_TIMEOUT_S = 300.0
 _SETTLE_TIMEOUT_S = 600.0
 # As fast as the mappers keep up: the player holds when one is this far behind, in recorded time.
 _UNLIMITED_RATE = 10_000.0
+_CLOCK_HZ = 5.0
 _MAX_LAG_S = 4.0
 
 
@@ -301,6 +302,8 @@ def _start_player(children: Children, rate: float | None, recordings: _Recording
     arguments = [str(bag) for bag in recordings.bags]
     arguments += ["--rate", str(rate or _UNLIMITED_RATE), "--max-lag-s", str(_MAX_LAG_S)]
     arguments += ["--wait-for", *topics]
+    # The nodes go by the messages' own stamps; every tick of /clock costs each of them a callback.
+    arguments += ["--ros-args", "-p", f"clock_hz:={_CLOCK_HZ}"]
     return children.start("bag_player", "uw_dslam_ros2.ros.bag_player", arguments, may_end=True)
 
 

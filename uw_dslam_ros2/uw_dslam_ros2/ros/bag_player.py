@@ -117,9 +117,13 @@ class BagPlayer(Node):
             self._pacer.restart()
             self._last_clock_ns = None
             self._lags.clear()
+            last: RawMessage | None = None
             for raw in _merged(readers, topics, start_ns, stop_ns):
                 if not self._publish(raw):
                     break
+                last = raw
+            if last is not None and last.stamp_ns != self._last_clock_ns:
+                self._tick(last.stamp_ns)  # the clock stands at the end, not at its last full step
             if not self._config.is_looping:
                 break
         self._flush()
@@ -201,8 +205,11 @@ class BagPlayer(Node):
     def _advance_clock(self, stamp_ns: int) -> None:
         last_ns = self._last_clock_ns
         if last_ns is None or stamp_ns - last_ns >= 1e9 / self._config.clock_hz:
-            self._clock_pub.publish(ClockMsg(clock=stamp_to_msg(stamp_ns)))
-            self._last_clock_ns = stamp_ns
+            self._tick(stamp_ns)
+
+    def _tick(self, stamp_ns: int) -> None:
+        self._clock_pub.publish(ClockMsg(clock=stamp_to_msg(stamp_ns)))
+        self._last_clock_ns = stamp_ns
 
     def _hold_for_followers(self, vehicle: str) -> None:
         if not self._lags.is_behind(vehicle):

@@ -110,7 +110,7 @@ class BagPlayerConfig(Config):
     is_looping: bool = setting(False, doc="begin again at the end; /clock jumps back then")
     is_paused: bool = setting(False, doc="wait for ~/pause (data: false) before playing")
     clock_hz: float = setting(
-        100.0, 1.0, 10000.0, "at most this rate of /clock, in recorded time [Hz]"
+        40.0, 1.0, 10000.0, "at most this rate of /clock, in recorded time [Hz]"
     )
     topics: tuple[str, ...] = setting((), doc="only these topics (and /tf_static); empty: all")
     wait_s: float = setting(
