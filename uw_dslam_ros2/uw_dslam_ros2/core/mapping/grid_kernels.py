@@ -11,6 +11,8 @@ from numba import njit
 __all__ = ["NUM_DIRECTIONS", "add_ping", "beam_table", "diamond", "resample_add"]
 
 NUM_DIRECTIONS = 16384
+_SLOTS_PER_BIN = 16
+_LONG_RUN, _SHORT_RUN = 32, 8
 
 
 @njit(cache=True, nogil=True)
@@ -50,30 +52,101 @@ def beam_table(bearing, half_width, num_directions):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True)
-def _add_water(  # type: ignore[no-untyped-def]
-    evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
-    table, free_range, free, echo, first_row, first_col,
-):  # fmt: skip
-    """Take `free` from every cell that a beam crosses before its free range, echoes excepted."""
-    num_rows, num_cols = evidence.shape
-    num_directions = table.shape[0]
-    scale = num_directions / 4.0
-    squares = free_range * free_range
+def _extremes(limit):  # type: ignore[no-untyped-def]
+    """Least and largest of `limit` over runs of bins: entry [j, i] is over 2^j bins from bin i on.
+
+    A bin is `_SLOTS_PER_BIN` directions.
+    """
+    num_bins = limit.shape[0] // _SLOTS_PER_BIN
+    num_levels = 1
+    while (1 << num_levels) <= num_bins:
+        num_levels += 1
+    least = np.empty((num_levels, num_bins))
+    most = np.empty((num_levels, num_bins))
+    for i in range(num_bins):
+        window = limit[i * _SLOTS_PER_BIN : (i + 1) * _SLOTS_PER_BIN]
+        least[0, i], most[0, i] = window.min(), window.max()
+    for j in range(1, num_levels):
+        half = 1 << (j - 1)
+        for i in range(num_bins - 2 * half + 1):
+            least[j, i] = min(least[j - 1, i], least[j - 1, i + half])
+            most[j, i] = max(most[j - 1, i], most[j - 1, i + half])
+    return least, most
+
+
+@njit(cache=True, nogil=True)
+def _slot(lx, ly, num_directions):  # type: ignore[no-untyped-def]
+    return min(int((diamond(lx, ly) + 2.0) * (num_directions / 4.0)), num_directions - 1)
+
+
+@njit(cache=True, nogil=True)
+def _run_state(dx0, dx1, dy, cos, sin, num_directions, least, most, level_of):  # type: ignore[no-untyped-def]
+    """Whether a run of cells in one row is all water (1), all unknown (-1), or not decided (0).
+
+    Along a row the direction from the sonar turns one way only and the distance has its largest
+    value at an end, so the ends decide; across the seam behind the sonar nothing is said.
+    """
+    first = _slot(cos * dx0 + sin * dy, -sin * dx0 + cos * dy, num_directions)
+    last = _slot(cos * dx1 + sin * dy, -sin * dx1 + cos * dy, num_directions)
+    if abs(first - last) > num_directions // 4:
+        return 0
+    # One more on each side: a direction between may be rounded past its neighbour.
+    low = max(min(first, last) - 1, 0) // _SLOTS_PER_BIN
+    high = min(max(first, last) + 1, num_directions - 1) // _SLOTS_PER_BIN
+    level = level_of[high - low + 1]
+    other = high - (1 << level) + 1
+    far = max(dx0 * dx0, dx1 * dx1) + dy * dy
+    if far < min(least[level, low], least[level, other]):
+        return 1
+    near = dy * dy
+    if dx0 > 0.0:
+        near += dx0 * dx0
+    elif dx1 < 0.0:
+        near += dx1 * dx1
+    if near >= max(most[level, low], most[level, other]):
+        return -1
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def _water_window(limit, sonar_x, sonar_y, cos, sin):  # type: ignore[no-untyped-def]
+    """Largest free range and the box around all free water: reach, low x, high x, low y, high y."""
+    num_directions = limit.shape[0]
     reach = 0.0
     low_x = high_x = sonar_x
     low_y = high_y = sonar_y
     for k in range(num_directions):
-        if table[k] >= 0:
-            rng = free_range[table[k]]
+        if limit[k] > 0.0:
+            rng = np.sqrt(limit[k])
             reach = max(reach, rng)
             # Back from the diamond angle to a direction.
-            p = (k + 0.5) / scale - 2.0
+            p = (k + 0.5) / (num_directions / 4.0) - 2.0
             ux = 1.0 - abs(p)
             uy = p if abs(p) <= 1.0 else np.sign(p) * (2.0 - abs(p))
             size = rng / np.sqrt(ux * ux + uy * uy)
             px, py = sonar_x + (cos * ux - sin * uy) * size, sonar_y + (sin * ux + cos * uy) * size
             low_x, high_x = min(low_x, px), max(high_x, px)
             low_y, high_y = min(low_y, py), max(high_y, py)
+    return reach, low_x, high_x, low_y, high_y
+
+
+@njit(cache=True, nogil=True)
+def _add_water(  # type: ignore[no-untyped-def]
+    evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin, limit, free,
+):  # fmt: skip
+    """Take `free` from every cell nearer than its direction's `limit` (a squared range).
+
+    Runs of cells are decided by their ends where possible; the others cell by cell.
+    """
+    num_rows, num_cols = evidence.shape
+    num_directions = limit.shape[0]
+    reach, low_x, high_x, low_y, high_y = _water_window(limit, sonar_x, sonar_y, cos, sin)
+    if reach <= 0.0:
+        return
+    least, most = _extremes(limit)
+    level_of = np.zeros(least.shape[1] + 1, np.int64)
+    for n in range(2, level_of.shape[0]):
+        level_of[n] = level_of[n // 2] + 1
     r0 = max(0, int(np.floor(low_y / resolution)) - 1 - origin_row)
     r1 = min(num_rows - 1, int(np.floor(high_y / resolution)) + 1 - origin_row)
     for row in range(r0, r1 + 1):
@@ -81,29 +154,41 @@ def _add_water(  # type: ignore[no-untyped-def]
         if abs(dy) >= reach:
             continue
         chord = np.sqrt(reach * reach - dy * dy)
-        left, right = (
-            max(low_x - resolution, sonar_x - chord),
-            min(high_x + resolution, sonar_x + chord),
-        )
+        left = max(low_x - resolution, sonar_x - chord)
+        right = min(high_x + resolution, sonar_x + chord)
         c0 = max(0, int(np.floor(left / resolution)) - origin_col)
         c1 = min(num_cols - 1, int(np.floor(right / resolution)) - origin_col)
-        echo_row = row - first_row
-        has_echo = 0 <= echo_row < echo.shape[0]
-        for col in range(c0, c1 + 1):
-            dx = (origin_col + col + 0.5) * resolution - sonar_x
-            lx, ly = cos * dx + sin * dy, -sin * dx + cos * dy
-            beam = table[min(int((diamond(lx, ly) + 2.0) * scale), num_directions - 1)]
-            if beam >= 0 and dx * dx + dy * dy < squares[beam]:
-                echo_col = col - first_col
-                if has_echo and 0 <= echo_col < echo.shape[1] and echo[echo_row, echo_col] > 0:
-                    continue
-                evidence[row, col] -= free
-                observed[row, col] = True
+        start, size = c0, _LONG_RUN
+        while start <= c1:
+            stop = min(start + size - 1, c1)
+            dx0 = (origin_col + start + 0.5) * resolution - sonar_x
+            dx1 = (origin_col + stop + 0.5) * resolution - sonar_x
+            state = _run_state(dx0, dx1, dy, cos, sin, num_directions, least, most, level_of)
+            if state == 0 and size == _LONG_RUN:
+                size = _SHORT_RUN
+                continue
+            if state == 1:
+                # Views counted from zero: the compiler then writes many cells at a time.
+                water, seen = evidence[row, start : stop + 1], observed[row, start : stop + 1]
+                for i in range(water.shape[0]):
+                    water[i] -= free
+                for i in range(seen.shape[0]):
+                    seen[i] = True
+            elif state == 0:
+                for col in range(start, stop + 1):
+                    dx = (origin_col + col + 0.5) * resolution - sonar_x
+                    slot = _slot(cos * dx + sin * dy, -sin * dx + cos * dy, num_directions)
+                    if dx * dx + dy * dy < limit[slot]:
+                        evidence[row, col] -= free
+                        observed[row, col] = True
+            start = stop + 1
+            if (start - c0) % _LONG_RUN == 0:
+                size = _LONG_RUN
 
 
 @njit(cache=True, nogil=True)
 def add_ping(  # type: ignore[no-untyped-def]
-    evidence, observed, origin_row, origin_col, resolution,
+    evidence, observed, echo, origin_row, origin_col, resolution,
     sonar_x, sonar_y, sonar_yaw,
     points, weight, sigma_range, beamwidth, max_spread,
     table, free_range, hit, free,
@@ -111,14 +196,21 @@ def add_ping(  # type: ignore[no-untyped-def]
     """Add one ping's evidence: at most one contribution to each cell, echo before water.
 
     Points (N, 2) are in the sonar's frame; cell (0, 0) has its outer corner at `origin` cells from
-    the frame's zero. Cells outside the grid are left out.
+    the frame's zero. Cells outside the grid are left out. `echo` (R, C) int16 is scratch: zeros in,
+    zeros out; making it anew for each ping would cost more than the ping.
     """
     num_rows, num_cols = evidence.shape
     cos, sin = np.cos(sonar_yaw), np.sin(sonar_yaw)
+    limit = np.full(table.shape[0], -1.0)
+    for k in range(table.shape[0]):
+        if table[k] >= 0:
+            limit[k] = free_range[table[k]] * free_range[table[k]]
+    _add_water(
+        evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
+        limit, free,
+    )  # fmt: skip
     count = points.shape[0]
     axes = np.empty((count, 6))  # of each echo: place, direction, spread along and across
-    low_x = high_x = sonar_x
-    low_y = high_y = sonar_y
     for i in range(count):
         rng = np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
         ux, uy = (points[i, 0] / rng, points[i, 1] / rng) if rng > 0.0 else (1.0, 0.0)
@@ -129,22 +221,15 @@ def add_ping(  # type: ignore[no-untyped-def]
         # cell, so that it shows.
         axes[i, 4] = max(sigma_range, 0.5 * resolution)
         axes[i, 5] = max(min(0.5 * beamwidth * rng, max_spread), 0.5 * resolution)
-        span = 2.0 * max(axes[i, 4], axes[i, 5])
-        low_x, high_x = min(low_x, axes[i, 0] - span), max(high_x, axes[i, 0] + span)
-        low_y, high_y = min(low_y, axes[i, 1] - span), max(high_y, axes[i, 1] + span)
-    first_col = max(0, int(np.floor(low_x / resolution)) - origin_col)
-    last_col = min(num_cols - 1, int(np.floor(high_x / resolution)) - origin_col)
-    first_row = max(0, int(np.floor(low_y / resolution)) - origin_row)
-    last_row = min(num_rows - 1, int(np.floor(high_y / resolution)) - origin_row)
-    height, width = max(0, last_row - first_row + 1), max(0, last_col - first_col + 1)
-    echo = np.zeros((height, width), np.int32)
+    touched_rows, touched_cols = np.empty(1024, np.int64), np.empty(1024, np.int64)
+    num_touched = 0
     for i in range(count):
         px, py, ax, ay = axes[i, 0], axes[i, 1], axes[i, 2], axes[i, 3]
         span = 2.0 * max(axes[i, 4], axes[i, 5])
-        c0 = max(first_col, int(np.floor((px - span) / resolution)) - origin_col)
-        c1 = min(last_col, int(np.floor((px + span) / resolution)) - origin_col)
-        r0 = max(first_row, int(np.floor((py - span) / resolution)) - origin_row)
-        r1 = min(last_row, int(np.floor((py + span) / resolution)) - origin_row)
+        c0 = max(0, int(np.floor((px - span) / resolution)) - origin_col)
+        c1 = min(num_cols - 1, int(np.floor((px + span) / resolution)) - origin_col)
+        r0 = max(0, int(np.floor((py - span) / resolution)) - origin_row)
+        r1 = min(num_rows - 1, int(np.floor((py + span) / resolution)) - origin_row)
         own_row = int(np.floor(py / resolution)) - origin_row
         own_col = int(np.floor(px / resolution)) - origin_col
         for row in range(r0, r1 + 1):
@@ -155,19 +240,29 @@ def add_ping(  # type: ignore[no-untyped-def]
                 size = (along / axes[i, 4]) ** 2 + (across / axes[i, 5]) ** 2
                 if row == own_row and col == own_col:
                     size = 0.0
-                if size < 4.0:
-                    value = np.int32(np.rint(hit * weight[i] * np.exp(-0.5 * size)))
-                    slot = echo[row - first_row, col - first_col]
-                    echo[row - first_row, col - first_col] = max(slot, value)
-    _add_water(
-        evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
-        table, free_range, free, echo, first_row, first_col,
-    )  # fmt: skip
-    for row in range(height):
-        for col in range(width):
-            if echo[row, col] > 0:
-                evidence[first_row + row, first_col + col] += echo[row, col]
-                observed[first_row + row, first_col + col] = True
+                if size >= 4.0:
+                    continue
+                value = np.int32(np.rint(hit * weight[i] * np.exp(-0.5 * size)))
+                before = np.int32(echo[row, col])
+                if value <= before:
+                    continue
+                if before == 0:
+                    # An echo here: what the water has taken is given back.
+                    wx = (origin_col + col + 0.5) * resolution - sonar_x
+                    wy = (origin_row + row + 0.5) * resolution - sonar_y
+                    slot = _slot(cos * wx + sin * wy, -sin * wx + cos * wy, limit.shape[0])
+                    if wx * wx + wy * wy < limit[slot]:
+                        evidence[row, col] += free
+                    observed[row, col] = True
+                    if num_touched == touched_rows.shape[0]:
+                        touched_rows = np.concatenate((touched_rows, np.empty_like(touched_rows)))
+                        touched_cols = np.concatenate((touched_cols, np.empty_like(touched_cols)))
+                    touched_rows[num_touched], touched_cols[num_touched] = row, col
+                    num_touched += 1
+                evidence[row, col] += value - before
+                echo[row, col] = value
+    for k in range(num_touched):
+        echo[touched_rows[k], touched_cols[k]] = 0
 
 
 @njit(cache=True, nogil=True)

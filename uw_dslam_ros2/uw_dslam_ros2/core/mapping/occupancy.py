@@ -28,7 +28,8 @@ UNITS_PER_NAT = 1000.0
 """Evidence is counted in integers of a thousandth of a nat, so that sums are exact in any
 order."""
 
-_TILE = 64
+# Growing means copying everything, so it goes in long steps.
+_TILE = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +116,7 @@ class GrowingGrid:
         self._row, self._col = 0, 0
         self._evidence = np.zeros((0, 0), np.int32)
         self._observed = np.zeros((0, 0), np.bool_)
+        self._scratch = np.zeros((0, 0), np.int16)
         self.num_pings = 0
 
     def add(self, detections: Detections, T_frame_sonar: SE2) -> None:
@@ -127,8 +129,8 @@ class GrowingGrid:
         self._grow_for(detections, T_frame_sonar, float(free_range.max(initial=0.0)))
         beams = beam_table(detections.bearing_rad, 0.75 * detections.beamwidth_rad, NUM_DIRECTIONS)
         add_ping(
-            self._evidence, self._observed, self._row, self._col, config.resolution_m,
-            T_frame_sonar.x, T_frame_sonar.y, T_frame_sonar.yaw,
+            self._evidence, self._observed, self._scratch, self._row, self._col,
+            config.resolution_m, T_frame_sonar.x, T_frame_sonar.y, T_frame_sonar.yaw,
             detections.points, detections.weight,
             detections.range_sigma_m, detections.beamwidth_rad, config.max_spread_m,
             beams, free_range,
@@ -189,6 +191,7 @@ class GrowingGrid:
             )
             evidence[window], observed[window] = self._evidence, self._observed
         self._row, self._col, self._evidence, self._observed = row, col, evidence, observed
+        self._scratch = np.zeros((rows, cols), np.int16)
 
 
 def fuse(parts: Iterable[tuple[SparseEvidence, SE2]], log_odds_max: float) -> OccupancyMap:
