@@ -55,16 +55,17 @@ def some_problems(rng):
     yield [Term(points[:5], np.ones(5), clutter)]
 
 
-def bound_box(problem, box):
+def bound_box(problem, box, floor=-math.inf):
     """Both bounds and the value at the centre."""
     box, out = np.asarray(box), np.empty(5)
+    cells = np.empty((4, problem.points.shape[1]), dtype=np.int32)
     first = kernels.bound_first(
         problem.points, problem.rows, problem.frames, problem.levels, problem.level_of,
-        problem.half_of, problem.bounds, problem.windows, box,
+        problem.half_of, problem.bounds, problem.windows, box, floor, cells,
     )  # fmt: skip
     kernels.bound_second(
         problem.points, problem.rows, problem.frames, problem.half_of, problem.coefficients,
-        problem.curvatures, box, out,
+        problem.curvatures, box, out, cells,
     )  # fmt: skip
     return first, out[0], out[1]
 

@@ -29,6 +29,11 @@ reachable rectangle against the field's range-maximum pyramid, and, where boxes 
 value, summed gradient and bounded curvature at the centre (Consolini et al., arXiv 1901.09641),
 which alone closes the gap. Local ascent from promising centres gives the lower bound (GOGMA, arXiv
 1603.00150) and does not touch the proof.
+
+With ``SearchSettings.keep`` below 1 the search then goes on to the rivals: every box that could
+hold ``keep`` times the best value is followed until it is excluded or lies in the neighbourhood of
+an optimum that was met. So the optima listed in ``SearchOutcome.rivals`` come with a proven bound
+of their surroundings, and ``upper_elsewhere`` bounds all other poses.
 """
 
 from __future__ import annotations
@@ -39,21 +44,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration import kernels
-from uw_dslam_ros2.core.registration.field import Field, window_spans
 from uw_dslam_ros2.core.registration.result import PriorWindow, Progress
+from uw_dslam_ros2.core.registration.rivals import Neighborhoods
+from uw_dslam_ros2.core.registration.search_problem import Problem, Term, as_points
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["SearchOutcome", "SearchSettings", "Status", "Term", "objective_at", "search"]
+__all__ = [
+    "Problem",
+    "SearchOutcome",
+    "SearchSettings",
+    "Status",
+    "Term",
+    "as_points",
+    "objective_at",
+    "search",
+]
 
 FloatArray = NDArray[np.float64]
 
 _BOX_BYTES = 7 * 8 + 8 + 4
-_SMALL = 4.0  # cells that a box may move the points by, for curvature to be tried
 _CHUNK = 2048  # boxes between two looks at the clock
+_MAX_OPTIMA = 512  # local optima remembered
 
 
 class Status(enum.Enum):
@@ -66,32 +81,6 @@ class Status(enum.Enum):
     CANCELLED = "cancelled"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Term:
-    """Weighted points and the field they are scored in; see the module's text."""
-
-    points: FloatArray  # (k, 2) [m]
-    weights: FloatArray  # (k,), not negative
-    field: Field
-    is_inverse: bool = False
-
-    def __post_init__(self) -> None:
-        points = np.ascontiguousarray(self.points, dtype=np.float64)
-        weights = np.ascontiguousarray(self.weights, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 2:
-            raise InvalidInputError(f"points have shape {points.shape}, expected (k, 2)")
-        if weights.shape != (len(points),):
-            raise InvalidInputError(
-                f"weights have shape {weights.shape}, expected ({len(points)},)"
-            )
-        if not np.isfinite(points).all():
-            raise InvalidInputError("points hold a number that is not finite")
-        if not (np.isfinite(weights).all() and (weights >= 0.0).all()):
-            raise InvalidInputError("weights hold a number that is negative or not finite")
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "weights", weights)
-
-
 @dataclass(frozen=True, slots=True)
 class SearchSettings:
     """When a search may end."""
@@ -100,7 +89,8 @@ class SearchSettings:
     max_boxes: int = 10_000_000
     max_seconds: float = math.inf  # counts only with a clock
     max_memory_mb: float = 512.0  # of the open boxes
-    keep: float = 1.0  # share of the lower bound down to which boxes stay open, for rivals
+    keep: float = 1.0  # share of the best value down to which rivals are looked for
+    rival_share: float = 1.0  # boxes for that, as a share of those that the proof took
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +105,16 @@ class SearchOutcome:
     num_open_boxes: int
     seconds: float  # NaN without a clock
     optima: FloatArray  # (F, 4): value, x, y, yaw of local optima met, best first, each pose once
+    rivals: (
+        FloatArray  # (R, 5): value, bound, x, y, yaw of other optima from `keep` on, best first
+    )
+    upper_elsewhere: float  # no pose beyond all neighbourhoods exceeds it
+    has_all_rivals: bool  # every pose above `keep` is in a neighbourhood, or uphill leads to one
+    neighborhoods: Neighborhoods
+
+    def upper_bound_near(self, T_target_source: SE2) -> float:
+        """Proven upper bound around a pose of the window: in its neighbourhood, or elsewhere."""
+        return min(self.upper_bound, self.neighborhoods.upper_bound(T_target_source))
 
     @property
     def gap(self) -> float:
@@ -122,154 +122,6 @@ class SearchOutcome:
         return (
             max(0.0, 1.0 - self.lower_bound / self.upper_bound) if self.upper_bound > 0.0 else 0.0
         )
-
-
-class Problem:
-    """Terms as the kernels want them: flat arrays, both frames moved to their middle."""
-
-    def __init__(self, terms: Sequence[Term], is_source_centred: bool = True) -> None:
-        self.terms = [term for term in terms if len(term.points)]
-        if not self.terms:
-            raise InvalidInputError("a search needs at least one term with points, got none")
-        self.source_center = self._center(False) if is_source_centred else np.zeros(2)
-        self.target_center = self._center(True)
-        points, rows, frames, levels = [], [], [], []
-        num_points, num_levels, sizes = 0, 0, np.zeros(3, dtype=np.int64)
-        for term in self.terms:
-            own, others = self.source_center, self.target_center
-            if term.is_inverse:
-                own, others = others, own
-            field = term.field
-            points.append(np.column_stack([term.points - own, term.weights]))
-            shape = field.coefficients.shape
-            rows.append(
-                [
-                    num_points,
-                    num_points + len(term.points),
-                    int(term.is_inverse),
-                    sizes[0],
-                    *shape,
-                    num_levels,
-                    sizes[2],
-                ]
-            )
-            frames.append([*(field.origin - others), field.pitch_m])
-            table = field.levels + np.array([sizes[1], 0, 0])
-            levels.append(table)
-            num_points += len(term.points)
-            num_levels += len(table)
-            sizes += [field.coefficients.size, field.bounds.size, field.curvatures.size]
-        self.points = np.ascontiguousarray(np.concatenate(points))
-        self.rows = np.array(rows, dtype=np.int64)
-        self.frames = np.array(frames, dtype=np.float64)
-        self.levels = np.ascontiguousarray(np.concatenate(levels))
-        self.coefficients = _joined([term.field.coefficients.ravel() for term in self.terms])
-        self.bounds = _joined([term.field.bounds for term in self.terms])
-        self.windows = _joined([term.field.windows.ravel() for term in self.terms])
-        self.curvatures = _joined([term.field.curvatures.ravel() for term in self.terms])
-        self.level_of = _level_table(int(self.rows[:, 4:6].max()))
-        self.half_of = window_spans()
-        self.window = self._window()
-        weights = self.points[:, 2]
-        spread = (self.points[:, :2] ** 2).sum(axis=1)
-        self.arm = math.sqrt(float((weights * spread).sum() / max(float(weights.sum()), 1e-300)))
-        self.reach = 5.0 * max(term.field.pitch_m for term in self.terms)
-        self.arm = max(self.arm, 1e-3 * self.reach)
-        self.small = _SMALL * min(term.field.pitch_m for term in self.terms)
-        peak = sum(
-            float(term.weights.sum()) * float(np.abs(term.field.coefficients).max())
-            for term in self.terms
-        )
-        self.margin = 1e-11 * peak * max(1.0, math.sqrt(len(self.points)) / 30.0)
-
-    def _center(self, is_target: bool) -> FloatArray:
-        """Weighted mean of the points in that frame, or the middle of the fields there."""
-        points = [term for term in self.terms if term.is_inverse == is_target]
-        if points:
-            weights = np.concatenate([term.weights for term in points])
-            stacked = np.concatenate([term.points for term in points])
-            if weights.sum() > 0.0:
-                middle = 0.5 * (stacked.min(axis=0) + stacked.max(axis=0))
-                mean: FloatArray = (
-                    middle + ((stacked - middle) * weights[:, None]).sum(axis=0) / weights.sum()
-                )
-                return mean
-            return stacked.mean(axis=0)
-        low, high = self._extent(
-            [term.field for term in self.terms if term.is_inverse != is_target]
-        )
-        return 0.5 * (low + high)
-
-    @staticmethod
-    def _extent(fields: Sequence[Field]) -> tuple[FloatArray, FloatArray]:
-        lows = [field.origin for field in fields]
-        highs = [
-            field.origin + field.pitch_m * (np.array(field.coefficients.shape)[::-1] - 1)
-            for field in fields
-        ]
-        return np.array(lows).min(axis=0), np.array(highs).max(axis=0)
-
-    def _window(self) -> FloatArray:
-        """All (theta, x, y) at which a point can touch its field: centre, half widths (6,)."""
-        lows, highs = [], []
-        for term in self.terms:
-            low, high = self._extent([term.field])
-            if term.is_inverse:
-                corners = np.maximum(
-                    np.abs(low - self.source_center), np.abs(high - self.source_center)
-                )
-                reach = float(np.hypot(*corners))
-                points = term.points - self.target_center
-                lows.append(points.min(axis=0) - reach)
-                highs.append(points.max(axis=0) + reach)
-            else:
-                reach = float(np.hypot(*(term.points - self.source_center).T).max())
-                lows.append(low - self.target_center - reach)
-                highs.append(high - self.target_center + reach)
-        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-        return np.array([0.0, *(0.5 * (low + high)), math.pi, *(0.5 * (high - low))])
-
-    def to_pose(self, theta: float, x: float, y: float) -> SE2:
-        """``T_target_source`` of the centred parameters."""
-        cos, sin = math.cos(theta), math.sin(theta)
-        sx, sy = self.source_center
-        tx, ty = self.target_center
-        return SE2(x + tx - (cos * sx - sin * sy), y + ty - (sin * sx + cos * sy), theta)
-
-    def from_pose(self, T_target_source: SE2) -> FloatArray:
-        """Centred parameters (theta, x, y) of a pose."""
-        moved = T_target_source.apply(self.source_center) - self.target_center
-        return np.array([T_target_source.yaw, *moved])
-
-    def value_at(self, parameters: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Objective, gradient (3,), second derivatives (3, 3) in (theta, x, y), all centred."""
-        gradient, hessian = np.zeros(3), np.zeros((3, 3))
-        value = kernels.evaluate(
-            self.points,
-            self.rows,
-            self.frames,
-            self.coefficients,
-            *map(float, parameters),
-            gradient,
-            hessian,
-        )
-        return float(value), gradient, hessian
-
-    def ascend(self, parameters: FloatArray, max_steps: int = 50) -> tuple[float, FloatArray]:
-        """Climb to the local optimum above (theta, x, y)."""
-        pose = np.array(parameters, dtype=np.float64)
-        value = kernels.ascend(
-            self.points,
-            self.rows,
-            self.frames,
-            self.coefficients,
-            self.window,
-            self.arm,
-            self.reach,
-            pose,
-            max_steps,
-        )
-        return float(value), pose
 
 
 def objective_at(terms: Sequence[Term], T_target_source: SE2) -> float:
@@ -334,7 +186,7 @@ class _Search:
         self._keys = np.empty(slots)
         self._heap = np.arange(slots, dtype=np.int32)
         self._counters = np.zeros(5, dtype=np.int64)
-        self._found = np.full((1024, 4), -math.inf)
+        self._found = np.full((_MAX_OPTIMA, 5), -math.inf)
         value, _, _ = problem.value_at(problem.window[:3])
         self._best = np.array([value, *problem.window[:3], 0.0, -math.inf])
         self._boxes[0, :6] = problem.window
@@ -350,17 +202,41 @@ class _Search:
         is_cancelled: Callable[[], bool] | None,
         stage: str,
     ) -> SearchOutcome:
-        """Chunks of boxes until the proof is complete or a budget is used up."""
+        """Chunks of boxes until the proof is complete or a budget is used up; then the rivals."""
+        max_boxes = self._settings.max_boxes
+        status = self._chunks(0.0, max_boxes, progress, is_cancelled, stage)
+        lower, upper = self._bounds()
+        has_all_rivals = self._settings.keep >= 1.0
+        if status is Status.CERTIFIED and not has_all_rivals:
+            spent = int(self._counters[kernels.NUM_BOXES])
+            max_boxes = min(max_boxes, spent + int(self._settings.rival_share * spent) + _CHUNK)
+            ended = self._chunks(
+                self._problem.radius, max_boxes, progress, is_cancelled, f"{stage}, rivals"
+            )
+            has_all_rivals = ended is Status.CERTIFIED
+        return self._outcome(status, lower, upper, has_all_rivals)
+
+    def _chunks(
+        self,
+        apart: float,
+        max_boxes: int,
+        progress: Callable[[Progress], None] | None,
+        is_cancelled: Callable[[], bool] | None,
+        stage: str,
+    ) -> Status:
+        """One phase: the proof with ``apart`` = 0, or that of the rivals."""
         settings, counters = self._settings, self._counters
-        status = None
-        while status is None:
-            left = settings.max_boxes - int(counters[kernels.NUM_BOXES])
-            self._run_chunk(min(_CHUNK, max(left, 0)))
+        while True:
+            left = max_boxes - int(counters[kernels.NUM_BOXES])
+            self._run_chunk(min(_CHUNK, max(left, 0)), apart)
+            status = None
             if counters[kernels.STATUS] == kernels.DONE:
                 status = Status.CERTIFIED
-            elif counters[kernels.STATUS] == kernels.HEAP_FULL and not self._grow():
+            elif counters[kernels.STATUS] == kernels.FOUND_FULL or (
+                counters[kernels.STATUS] == kernels.HEAP_FULL and not self._grow()
+            ):
                 status = Status.MEMORY
-            elif counters[kernels.NUM_BOXES] >= settings.max_boxes:
+            elif counters[kernels.NUM_BOXES] >= max_boxes:
                 status = Status.BOXES
             elif self._clock and self._clock() - self._start >= settings.max_seconds:
                 status = Status.TIME
@@ -368,14 +244,15 @@ class _Search:
                 progress(self._progress(stage))
             if status is None and is_cancelled and is_cancelled():
                 status = Status.CANCELLED
-        return self._outcome(status)
+            if status is not None:
+                return status
 
-    def _run_chunk(self, max_boxes: int) -> None:
+    def _run_chunk(self, max_boxes: int, apart: float) -> None:
         p, settings = self._problem, self._settings
         kernels.run(
             p.points, p.rows, p.frames, p.levels, p.level_of, p.half_of,
             p.coefficients, p.bounds, p.windows, p.curvatures, p.window,
-            p.arm, p.reach, p.margin, p.small, settings.gap, settings.keep, max_boxes,
+            p.arm, p.reach, p.margin, p.small, settings.gap, settings.keep, apart, max_boxes,
             self._boxes, self._keys, self._heap, self._counters, self._best, self._found,
         )  # fmt: skip
 
@@ -393,9 +270,12 @@ class _Search:
 
     def _bounds(self) -> tuple[float, float]:
         lower = float(self._best[0]) - self._problem.margin
+        return lower, max(self._top(), float(self._best[0]) + self._problem.margin)
+
+    def _top(self) -> float:
+        """Largest bound of an open box."""
         num_open = int(self._counters[kernels.NUM_OPEN])
-        upper = float(self._keys[self._heap[0]]) if num_open else float(self._best[0])
-        return lower, max(upper, float(self._best[0]) + self._problem.margin)
+        return float(self._keys[self._heap[0]]) if num_open else -math.inf
 
     def _progress(self, stage: str) -> Progress:
         lower, upper = self._bounds()
@@ -410,14 +290,23 @@ class _Search:
             pose,
         )
 
-    def _outcome(self, status: Status) -> SearchOutcome:
+    def _outcome(
+        self, status: Status, lower: float, upper: float, has_all_rivals: bool
+    ) -> SearchOutcome:
         p, counters = self._problem, self._counters
         value, pose = p.ascend(self._best[1:4])
         if value > self._best[0]:
             self._best[0], self._best[1:4] = value, pose
-        lower, upper = self._bounds()
-        found = self._found[: min(int(counters[kernels.NUM_FOUND]), len(self._found))]
-        found = np.concatenate([self._best[None, :4], found])
+        lower = float(self._best[0]) - p.margin
+        upper = max(upper, float(self._best[0]) + p.margin)
+        found = self._found[: int(counters[kernels.NUM_FOUND])]
+        found = np.vstack([[*self._best[:4], -math.inf], found])
+        found = found[np.argsort(-found[:, 0], kind="stable")]
+        neighborhoods = Neighborhoods.of(
+            p, found, max(self._top(), self._settings.keep * lower), float(self._best[5])
+        )
+        distinct = found[neighborhoods.apart_from_better(0.2 * p.reach)]
+        poses = [p.to_pose(*row[1:4]) for row in distinct]
         return SearchOutcome(
             T_target_source=p.to_pose(*self._best[1:4]),
             lower_bound=lower,
@@ -426,51 +315,11 @@ class _Search:
             num_boxes=int(counters[kernels.NUM_BOXES]),
             num_open_boxes=int(counters[kernels.NUM_OPEN]),
             seconds=self._clock() - self._start if self._clock else math.nan,
-            optima=self._distinct(found),
+            optima=np.array(
+                [[v, t.x, t.y, t.yaw] for v, t in zip(distinct[:, 0], poses, strict=True)]
+            ),
+            rivals=neighborhoods.rivals(self._settings.keep * lower),
+            upper_elsewhere=min(upper, neighborhoods.upper_elsewhere),
+            has_all_rivals=has_all_rivals,
+            neighborhoods=neighborhoods,
         )
-
-    def _distinct(self, found: FloatArray) -> FloatArray:
-        """Best first, poses closer than a cell of the field counted once."""
-        p = self._problem
-        found = found[np.argsort(-found[:, 0], kind="stable")]
-        scaled = np.column_stack(
-            [p.arm * np.cos(found[:, 1]), p.arm * np.sin(found[:, 1]), found[:, 2], found[:, 3]]
-        )
-        chosen: list[int] = []
-        for k in range(len(found)):
-            apart = (
-                np.abs(scaled[chosen] - scaled[k]).max(axis=1) if chosen else np.array([math.inf])
-            )
-            if apart.min() > 0.2 * p.reach and np.isfinite(found[k, 0]):
-                chosen.append(k)
-        poses = [p.to_pose(*found[k, 1:]) for k in chosen]
-        return np.array(
-            [[found[k, 0], t.x, t.y, t.yaw] for k, t in zip(chosen, poses, strict=True)]
-        )
-
-
-def _joined(arrays: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """One flat array; a single one is not copied."""
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
-
-
-def _level_table(size: int) -> NDArray[np.int8]:
-    """For every span: smallest pyramid level whose windows hold span + 1 cells from anywhere."""
-    table = np.empty(size + 1, dtype=np.int8)
-    level = 0
-    for span in range(size + 1):
-        while (1 << level) - (1 << max(0, level - 2)) < span:
-            level += 1
-        table[span] = level
-    return table
-
-
-def as_points(points: ArrayLike, name: str) -> FloatArray:
-    """Checked points (N, 2) float64 [m]."""
-    array = np.ascontiguousarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise InvalidInputError(f"{name} has shape {array.shape}, expected (N, 2)")
-    if not np.isfinite(array).all():
-        bad = array[~np.isfinite(array).all(axis=1)][0]
-        raise InvalidInputError(f"{name} holds {bad.tolist()}, expected finite coordinates")
-    return array

@@ -1,13 +1,14 @@
 # mypy: allow-untyped-defs
 """Compiled heart of the search: bounds of boxes, local ascent, the best-first loop over a heap.
 
-Everything is flat arrays. ``points`` (K, 3) hold x, y, weight; ``terms`` (T, 8) integers: first
-point, end point, is_inverse, offset of the coefficients, rows, columns, first level, offset of the
-windows and curvatures; ``frames`` (T, 3): origin x, y and pitch; ``levels`` (L, 3): offset of the
-bounds, columns, shift, of all fields after each other; ``level_of[span]``: the level whose windows
-hold ``span + 1`` cells wherever they start; ``half_of[span]``: that of which two overlapping
-windows hold them exactly. ``heap`` holds every slot of ``boxes`` once: the open ones as a binary
-heap by ``keys``, behind them the free ones.
+Everything is flat arrays. ``points`` (4, K) hold x, y, weight, and the most that all later points
+can bring; ``terms`` (T, 8) integers: first point, end point, is_inverse, offset of the
+coefficients, rows, columns, first level, offset of the windows and curvatures; ``frames`` (T, 4):
+origin x, y, pitch, and rounding of a place in cells; ``levels`` (L, 3): offset of the bounds,
+columns, shift, of all fields after each other; ``level_of[span]``: the level whose windows hold
+``span + 1`` cells wherever they start; ``half_of[span]``: that of which two overlapping windows
+hold them exactly. ``heap`` holds every slot of ``boxes`` once: the open ones as a binary heap by
+``keys``, behind them the free ones.
 
 A box is (theta, x, y, half theta, half x, half y). The motion is ``p = R(theta) x + t`` for a
 forward term and ``p = R(theta)^T (y - t)`` for an inverse one.
@@ -22,94 +23,149 @@ from numba import njit
 
 __all__ = ["ascend", "bound_first", "bound_second", "evaluate", "run"]
 
-# Slots of the search's counters and of its best pose.
+# Slots of the search's counters, and what it stopped for.
 NUM_OPEN, NUM_BOXES, NUM_SECOND, NUM_FOUND, STATUS = range(5)
-DONE, CHUNK_ENDED, HEAP_FULL = range(3)
+DONE, CHUNK_ENDED, HEAP_FULL, FOUND_FULL = range(4)
 
 
 @njit(cache=True, nogil=True)
-def _reach(cos, sin, tx, ty, h_x, h_y, swing, bow, is_inverse, x, y):
-    """Turned point (about the centre of rotation), its place, and the rectangle a box takes it to.
+def _turn(box):
+    """Cosine and sine of the centre's turn; largest sin(delta) and 1 - cos(delta) beside it."""
+    half = min(box[3], math.pi)
+    swing = math.sin(half) if half < 0.5 * math.pi else 1.0
+    return math.cos(box[0]), math.sin(box[0]), swing, 1.0 - math.cos(half)
 
-    Returns the turned point, its place at the centre of the box, and middle and half widths of the
-    rectangle. A turn by delta moves a turned point r by sin(delta) J r - (1 - cos(delta)) r.
+
+@njit(cache=True, nogil=True)
+def _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells):
+    """Cells that a term's points can reach: first column and row, last column and row.
+
+    A turn by delta moves a turned point r by sin(delta) J r - (1 - cos(delta)) r. What lies beyond
+    the field is moved to its rim, which is zero. There are no branches, so that the compiler uses
+    vector instructions.
     """
-    if is_inverse:
-        rx = cos * (x - tx) + sin * (y - ty)
-        ry = -sin * (x - tx) + cos * (y - ty)
-        e_x = abs(cos) * h_x + abs(sin) * h_y
-        e_y = abs(sin) * h_x + abs(cos) * h_y
-        half_x = e_x * (1.0 + bow) + swing * (abs(ry) + e_y) + 0.5 * bow * abs(rx)
-        half_y = e_y * (1.0 + bow) + swing * (abs(rx) + e_x) + 0.5 * bow * abs(ry)
-        return rx, ry, rx, ry, rx - 0.5 * bow * rx, ry - 0.5 * bow * ry, half_x, half_y
-    rx = cos * x - sin * y
-    ry = sin * x + cos * y
-    px, py = rx + tx, ry + ty
-    half_x = h_x + swing * abs(ry) + 0.5 * bow * abs(rx)
-    half_y = h_y + swing * abs(rx) + 0.5 * bow * abs(ry)
-    return rx, ry, px, py, px - 0.5 * bow * rx, py - 0.5 * bow * ry, half_x, half_y
+    first, end = terms[t, 0], terms[t, 1]
+    scale, rounding = 1.0 / frames[t, 2], frames[t, 3]
+    shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
+    right, top = terms[t, 5] - 1.0, terms[t, 4] - 1.0
+    tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
+    bow *= 0.5
+    c, s, stay = cos * scale, sin * scale, 1.0 - bow
+    xs, ys = points[0, first:end], points[1, first:end]
+    low_x, low_y, high_x, high_y = cells[0], cells[1], cells[2], cells[3]
+    if terms[t, 2] != 0:
+        # The box of translations is turned, too.
+        e_x = scale * (abs(cos) * h_x + abs(sin) * h_y)
+        e_y = scale * (abs(sin) * h_x + abs(cos) * h_y)
+        reach_x = e_x * (1.0 + 2.0 * bow) + swing * e_y + rounding
+        reach_y = e_y * (1.0 + 2.0 * bow) + swing * e_x + rounding
+        for k in range(end - first):
+            x, y = xs[k] - tx, ys[k] - ty
+            rx, ry = c * x + s * y, c * y - s * x
+            u, v = stay * rx + shift_x, stay * ry + shift_y
+            half_x = reach_x + swing * abs(ry) + bow * abs(rx)
+            half_y = reach_y + swing * abs(rx) + bow * abs(ry)
+            low_x[k] = np.int32(min(max(u - half_x, 0.0), right))
+            low_y[k] = np.int32(min(max(v - half_y, 0.0), top))
+            high_x[k] = np.int32(min(max(u + half_x, 0.0), right))
+            high_y[k] = np.int32(min(max(v + half_y, 0.0), top))
+        return
+    shift_x, shift_y = shift_x + scale * tx, shift_y + scale * ty
+    reach_x, reach_y = scale * h_x + rounding, scale * h_y + rounding
+    for k in range(end - first):
+        rx, ry = c * xs[k] - s * ys[k], s * xs[k] + c * ys[k]
+        u, v = stay * rx + shift_x, stay * ry + shift_y
+        half_x = reach_x + swing * abs(ry) + bow * abs(rx)
+        half_y = reach_y + swing * abs(rx) + bow * abs(ry)
+        low_x[k] = np.int32(min(max(u - half_x, 0.0), right))
+        low_y[k] = np.int32(min(max(v - half_y, 0.0), top))
+        high_x[k] = np.int32(min(max(u + half_x, 0.0), right))
+        high_y[k] = np.int32(min(max(v + half_y, 0.0), top))
 
 
 @njit(cache=True, nogil=True)
-def bound_first(points, terms, frames, levels, level_of, half_of, bounds, windows, box):
-    """Upper bound over a box: every point at the best place that it can reach."""
-    cos, sin = math.cos(box[0]), math.sin(box[0])
-    swing = math.sin(box[3]) if box[3] < 0.5 * math.pi else 1.0
-    bow = 1.0 - math.cos(min(box[3], math.pi))
-    tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
+def bound_first(
+    points, terms, frames, levels, level_of, half_of, bounds, windows, box, floor, cells
+):
+    """Upper bound over a box: every point at the best place that it can reach.
+
+    Ends early, with a bound that is still true, once the other points cannot lift it over `floor`.
+    """
     total = 0.0
+    cos, sin, swing, bow = _turn(box)
     for t in range(terms.shape[0]):
-        is_inverse = terms[t, 2] != 0
-        num_rows, num_cols, first_level = terms[t, 4], terms[t, 5], terms[t, 6]
+        first, num_cols, plane = terms[t, 0], terms[t, 5], terms[t, 4] * terms[t, 5]
         at_windows = terms[t, 7]
-        scale = 1.0 / frames[t, 2]
-        shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
-        for k in range(terms[t, 0], terms[t, 1]):
-            _, _, _, _, mid_x, mid_y, half_x, half_y = _reach(
-                cos, sin, tx, ty, h_x, h_y, swing, bow, is_inverse, points[k, 0], points[k, 1]
-            )
-            u, v = mid_x * scale + shift_x, mid_y * scale + shift_y
-            eu, ev = half_x * scale + 1e-9, half_y * scale + 1e-9
-            if u + eu < 0.0 or v + ev < 0.0 or u - eu >= num_cols or v - ev >= num_rows:
-                continue
-            i0, j0 = int(max(u - eu, 0.0)), int(max(v - ev, 0.0))
-            i1, j1 = int(min(u + eu, num_cols - 1.0)), int(min(v + ev, num_rows - 1.0))
+        _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells)
+        for k in range(terms[t, 1] - first):
+            i0, j0 = np.int64(cells[0, k]), np.int64(cells[1, k])
+            i1, j1 = np.int64(cells[2, k]), np.int64(cells[3, k])
             span = max(i1 - i0, j1 - j0)
             if span < half_of.shape[0]:
-                total += points[k, 2] * _largest(
-                    windows, at_windows, num_rows, num_cols, half_of, i0, j0, i1, j1
-                )
-                continue
-            row = first_level + level_of[span]
-            shift = levels[row, 2]
-            at = levels[row, 0] + (j0 >> shift) * levels[row, 1] + (i0 >> shift)
-            total += points[k, 2] * bounds[at]
+                value = _largest(windows, at_windows, plane, num_cols, half_of, i0, j0, i1, j1)
+            else:
+                row = terms[t, 6] + level_of[span]
+                shift = levels[row, 2]
+                at = levels[row, 0] + (j0 >> shift) * levels[row, 1] + (i0 >> shift)
+                value = bounds[np.uint64(at)]
+            total += points[2, first + k] * value
+            if k & 15 == 15 and total + points[3, first + k] <= floor:
+                return total + points[3, first + k]
     return total
 
 
 @njit(cache=True, nogil=True)
-def _largest(windows, at, num_rows, num_cols, half_of, i0, j0, i1, j1):
-    """Exact maximum over a rectangle of cells, from four overlapping windows."""
-    level = half_of[max(i1 - i0, j1 - j0)]
+def _largest(windows, at, plane, num_cols, half_of, i0, j0, i1, j1):
+    """Exact maximum over a rectangle of cells, from four overlapping windows.
+
+    Unsigned indices, for numba asks of signed ones whether they count from the end.
+    """
+    level = np.int64(half_of[np.uint64(max(i1 - i0, j1 - j0))])
     size = 1 << level
-    at += level * num_rows * num_cols
+    at += level * plane
     right, top = max(i1 - size + 1, i0), max(j1 - size + 1, j0)
     low, high = at + j0 * num_cols, at + top * num_cols
     return max(
-        max(windows[low + i0], windows[low + right]),
-        max(windows[high + i0], windows[high + right]),
+        max(windows[np.uint64(low + i0)], windows[np.uint64(low + right)]),
+        max(windows[np.uint64(high + i0)], windows[np.uint64(high + right)]),
     )
 
 
 @njit(cache=True, nogil=True)
-def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, out):
+def _spline(coefficients, at, num_cols, a, b):
+    """Value, slopes and second derivatives, in cells, of the spline at (a, b) from a node."""
+    a0, a1, a2 = 0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2
+    b0, b1, b2 = 0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2
+    low, mid, high = np.uint64(at), np.uint64(at + num_cols), np.uint64(at + 2 * num_cols)
+    one, two = np.uint64(1), np.uint64(2)
+    c00, c01, c02 = coefficients[low], coefficients[low + one], coefficients[low + two]
+    c10, c11, c12 = coefficients[mid], coefficients[mid + one], coefficients[mid + two]
+    c20, c21, c22 = coefficients[high], coefficients[high + one], coefficients[high + two]
+    line0 = a0 * c00 + a1 * c01 + a2 * c02
+    line1 = a0 * c10 + a1 * c11 + a2 * c12
+    line2 = a0 * c20 + a1 * c21 + a2 * c22
+    slope0 = (0.5 + a) * (c02 - c01) + (0.5 - a) * (c01 - c00)
+    slope1 = (0.5 + a) * (c12 - c11) + (0.5 - a) * (c11 - c10)
+    slope2 = (0.5 + a) * (c22 - c21) + (0.5 - a) * (c21 - c20)
+    bend0, bend1, bend2 = c02 - 2.0 * c01 + c00, c12 - 2.0 * c11 + c10, c22 - 2.0 * c21 + c20
+    return (
+        b0 * line0 + b1 * line1 + b2 * line2,
+        b0 * slope0 + b1 * slope1 + b2 * slope2,
+        (0.5 + b) * (line2 - line1) + (0.5 - b) * (line1 - line0),
+        b0 * bend0 + b1 * bend1 + b2 * bend2,
+        (0.5 + b) * (slope2 - slope1) + (0.5 - b) * (slope1 - slope0),
+        line2 - 2.0 * line1 + line0,
+    )
+
+
+@njit(cache=True, nogil=True)
+def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, out, cells):
     """Upper bound over a small box from value, summed gradient and bounded curvature.
 
     ``out``: the bound, the value at the centre, and the rise that theta, x and y can bring. The
     bound is infinite where the box is too large for the tables.
     """
-    cos, sin = math.cos(box[0]), math.sin(box[0])
-    swing, bow = math.sin(box[3]), 1.0 - math.cos(box[3])
+    cos, sin, swing, bow = _turn(box)
     tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
     value = 0.0
     g_x, g_y, g_theta = 0.0, 0.0, 0.0
@@ -118,53 +174,41 @@ def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, 
     for t in range(terms.shape[0]):
         is_inverse = terms[t, 2] != 0
         at_coefficients, num_rows, num_cols = terms[t, 3], terms[t, 4], terms[t, 5]
-        at_curvatures = terms[t, 7]
+        at_curvatures, plane = terms[t, 7], terms[t, 4] * terms[t, 5]
         scale = 1.0 / frames[t, 2]
         shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
+        if not is_inverse:
+            shift_x, shift_y = shift_x + scale * tx, shift_y + scale * ty
         s0, sx, sy, s_theta, s_radial = 0.0, 0.0, 0.0, 0.0, 0.0
         la, lx, ly, lc = 0.0, 0.0, 0.0, 0.0
-        for k in range(terms[t, 0], terms[t, 1]):
-            rx, ry, px, py, mid_x, mid_y, half_x, half_y = _reach(
-                cos, sin, tx, ty, h_x, h_y, swing, bow, is_inverse, points[k, 0], points[k, 1]
-            )
-            weight = points[k, 2]
-            u, v = mid_x * scale + shift_x, mid_y * scale + shift_y
-            eu, ev = half_x * scale + 1e-9, half_y * scale + 1e-9
-            if u + eu < 0.0 or v + ev < 0.0 or u - eu >= num_cols or v - ev >= num_rows:
-                continue
-            i0, j0 = int(max(u - eu, 0.0)), int(max(v - ev, 0.0))
-            i1, j1 = int(min(u + eu, num_cols - 1.0)), int(min(v + ev, num_rows - 1.0))
+        first = terms[t, 0]
+        _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells)
+        for k in range(first, terms[t, 1]):
+            i0, j0 = np.int64(cells[0, k - first]), np.int64(cells[1, k - first])
+            i1, j1 = np.int64(cells[2, k - first]), np.int64(cells[3, k - first])
             if max(i1 - i0, j1 - j0) >= half_of.shape[0]:
                 return
+            x, y, weight = points[0, k], points[1, k], points[2, k]
+            if is_inverse:
+                rx = cos * (x - tx) + sin * (y - ty)
+                ry = cos * (y - ty) - sin * (x - tx)
+            else:
+                rx, ry = cos * x - sin * y, sin * x + cos * y
             curvature = weight * _largest(
-                curvatures, at_curvatures, num_rows, num_cols, half_of, i0, j0, i1, j1
+                curvatures, at_curvatures, plane, num_cols, half_of, i0, j0, i1, j1
             )
             la += curvature
             lx += curvature * rx
             ly += curvature * ry
             lc += curvature * (rx * rx + ry * ry)
-            u, v = px * scale + shift_x, py * scale + shift_y
+            u, v = rx * scale + shift_x, ry * scale + shift_y
             if not (1.0 <= u < num_cols - 1 and 1.0 <= v < num_rows - 1):
                 continue
             i, j = int(u), int(v)
-            a, b = u - 0.5 - i, v - 0.5 - j
-            a0, a1, a2 = 0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2
-            b0, b1, b2 = 0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2
             at = at_coefficients + (j - 1) * num_cols + i - 1
-            c00, c01, c02 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-            at += num_cols
-            c10, c11, c12 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-            at += num_cols
-            c20, c21, c22 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-            line0 = a0 * c00 + a1 * c01 + a2 * c02
-            line1 = a0 * c10 + a1 * c11 + a2 * c12
-            line2 = a0 * c20 + a1 * c21 + a2 * c22
-            s0 += weight * (b0 * line0 + b1 * line1 + b2 * line2)
-            fy = weight * scale * ((0.5 + b) * (line2 - line1) + (0.5 - b) * (line1 - line0))
-            slope0 = (0.5 + a) * (c02 - c01) + (0.5 - a) * (c01 - c00)
-            slope1 = (0.5 + a) * (c12 - c11) + (0.5 - a) * (c11 - c10)
-            slope2 = (0.5 + a) * (c22 - c21) + (0.5 - a) * (c21 - c20)
-            fx = weight * scale * (b0 * slope0 + b1 * slope1 + b2 * slope2)
+            field, fx, fy, _, _, _ = _spline(coefficients, at, num_cols, u - 0.5 - i, v - 0.5 - j)
+            fx, fy = weight * scale * fx, weight * scale * fy
+            s0 += weight * field
             sx += fx
             sy += fy
             s_theta += fy * rx - fx * ry
@@ -217,84 +261,78 @@ def _parabola(slope, curvature, half_width):
 
 
 @njit(cache=True, nogil=True)
-def evaluate(points, terms, frames, coefficients, theta, tx, ty, gradient, hessian):
+def evaluate(points, terms, frames, coefficients, pose, gradient, hessian):
     """Objective at a pose with its exact gradient and second derivatives, order theta, x, y."""
-    cos, sin = math.cos(theta), math.sin(theta)
+    cos, sin = math.cos(pose[0]), math.sin(pose[0])
     value = 0.0
     gradient[:] = 0.0
     hessian[:, :] = 0.0
     for t in range(terms.shape[0]):
         is_inverse = terms[t, 2] != 0
         at_coefficients, num_rows, num_cols = terms[t, 3], terms[t, 4], terms[t, 5]
-        origin_x, origin_y, scale = frames[t, 0], frames[t, 1], 1.0 / frames[t, 2]
+        scale = 1.0 / frames[t, 2]
+        shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
+        if not is_inverse:
+            shift_x, shift_y = shift_x + scale * pose[1], shift_y + scale * pose[2]
+        s0, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        s_theta, s_x, s_y, s_turn = 0.0, 0.0, 0.0, 0.0
         for k in range(terms[t, 0], terms[t, 1]):
-            x, y, weight = points[k, 0], points[k, 1], points[k, 2]
+            x, y, weight = points[0, k], points[1, k], points[2, k]
             if is_inverse:
-                rx = cos * (x - tx) + sin * (y - ty)
-                ry = -sin * (x - tx) + cos * (y - ty)
-                u = (rx - origin_x) * scale + 0.5
-                v = (ry - origin_y) * scale + 0.5
+                x, y = x - pose[1], y - pose[2]
+                rx, ry = cos * x + sin * y, cos * y - sin * x
             else:
-                rx = cos * x - sin * y
-                ry = sin * x + cos * y
-                u = (rx + tx - origin_x) * scale + 0.5
-                v = (ry + ty - origin_y) * scale + 0.5
+                rx, ry = cos * x - sin * y, sin * x + cos * y
+            u, v = rx * scale + shift_x, ry * scale + shift_y
             if not (1.0 <= u < num_cols - 1 and 1.0 <= v < num_rows - 1):
                 continue
             i, j = int(u), int(v)
-            a, b = u - 0.5 - i, v - 0.5 - j
-            a0, a1, a2 = 0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2
-            b0, b1, b2 = 0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2
             at = at_coefficients + (j - 1) * num_cols + i - 1
-            c00, c01, c02 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-            at += num_cols
-            c10, c11, c12 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-            at += num_cols
-            c20, c21, c22 = coefficients[at], coefficients[at + 1], coefficients[at + 2]
-            line0 = a0 * c00 + a1 * c01 + a2 * c02
-            line1 = a0 * c10 + a1 * c11 + a2 * c12
-            line2 = a0 * c20 + a1 * c21 + a2 * c22
-            slope0 = (0.5 + a) * (c02 - c01) + (0.5 - a) * (c01 - c00)
-            slope1 = (0.5 + a) * (c12 - c11) + (0.5 - a) * (c11 - c10)
-            slope2 = (0.5 + a) * (c22 - c21) + (0.5 - a) * (c21 - c20)
-            value += weight * (b0 * line0 + b1 * line1 + b2 * line2)
-            fx = weight * scale * (b0 * slope0 + b1 * slope1 + b2 * slope2)
-            fy = weight * scale * ((0.5 + b) * (line2 - line1) + (0.5 - b) * (line1 - line0))
-            second = weight * scale * scale
-            fxx = second * (
-                b0 * (c02 - 2.0 * c01 + c00)
-                + b1 * (c12 - 2.0 * c11 + c10)
-                + b2 * (c22 - 2.0 * c21 + c20)
+            field, fx, fy, fxx, fxy, fyy = _spline(
+                coefficients, at, num_cols, u - 0.5 - i, v - 0.5 - j
             )
-            fyy = second * (line2 - 2.0 * line1 + line0)
-            fxy = second * ((0.5 + b) * (slope2 - slope1) + (0.5 - b) * (slope1 - slope0))
-            if is_inverse:
-                # p = R^T (y - t): dp/dtheta = -J p, dp/dt = -R^T.
-                vx, vy = ry, -rx
-                gradient[0] += fx * vx + fy * vy
-                gradient[1] -= cos * fx - sin * fy
-                gradient[2] -= sin * fx + cos * fy
-                hx, hy = fxx * vx + fxy * vy, fxy * vx + fyy * vy
-                hessian[0, 0] += hx * vx + hy * vy - fx * rx - fy * ry
-                # d/dtheta of -R F' with F' in the rotated axes: -R (H v) - R J F'.
-                mx, my = hx - fy, hy + fx
-                hessian[0, 1] -= cos * mx - sin * my
-                hessian[0, 2] -= sin * mx + cos * my
-                hessian[1, 1] += cos * cos * fxx - 2.0 * cos * sin * fxy + sin * sin * fyy
-                hessian[2, 2] += sin * sin * fxx + 2.0 * cos * sin * fxy + cos * cos * fyy
-                hessian[1, 2] += cos * sin * (fxx - fyy) + (cos * cos - sin * sin) * fxy
-            else:
-                vx, vy = -ry, rx
-                gradient[0] += fx * vx + fy * vy
-                gradient[1] += fx
-                gradient[2] += fy
-                hx, hy = fxx * vx + fxy * vy, fxy * vx + fyy * vy
-                hessian[0, 0] += hx * vx + hy * vy - fx * rx - fy * ry
-                hessian[0, 1] += hx
-                hessian[0, 2] += hy
-                hessian[1, 1] += fxx
-                hessian[1, 2] += fxy
-                hessian[2, 2] += fyy
+            first, second = weight * scale, weight * scale * scale
+            fx, fy, fxx, fxy, fyy = (
+                first * fx,
+                first * fy,
+                second * fxx,
+                second * fxy,
+                second * fyy,
+            )
+            s0 += weight * field
+            sx += fx
+            sy += fy
+            sxx += fxx
+            sxy += fxy
+            syy += fyy
+            # The point moves along J r as theta grows.
+            s_theta += fy * rx - fx * ry
+            hx, hy = fxy * rx - fxx * ry, fyy * rx - fxy * ry
+            s_x += hx
+            s_y += hy
+            s_turn += hy * rx - hx * ry - fx * rx - fy * ry
+        value += s0
+        hessian[0, 0] += s_turn
+        if is_inverse:
+            # p = R^T (y - t): dp/dtheta = -J p, dp/dt = -R^T; d/dtheta of -R F' adds -R J F'.
+            gradient[0] -= s_theta
+            gradient[1] -= cos * sx - sin * sy
+            gradient[2] -= sin * sx + cos * sy
+            mx, my = s_x + sy, s_y - sx
+            hessian[0, 1] += cos * mx - sin * my
+            hessian[0, 2] += sin * mx + cos * my
+            hessian[1, 1] += cos * cos * sxx - 2.0 * cos * sin * sxy + sin * sin * syy
+            hessian[2, 2] += sin * sin * sxx + 2.0 * cos * sin * sxy + cos * cos * syy
+            hessian[1, 2] += cos * sin * (sxx - syy) + (cos * cos - sin * sin) * sxy
+        else:
+            gradient[0] += s_theta
+            gradient[1] += sx
+            gradient[2] += sy
+            hessian[0, 1] += s_x
+            hessian[0, 2] += s_y
+            hessian[1, 1] += sxx
+            hessian[1, 2] += sxy
+            hessian[2, 2] += syy
     hessian[1, 0], hessian[2, 0], hessian[2, 1] = hessian[0, 1], hessian[0, 2], hessian[1, 2]
     return value
 
@@ -332,17 +370,17 @@ def _solve(matrix, damping, arm, right, step):
 
 
 @njit(cache=True, nogil=True)
-def ascend(points, terms, frames, coefficients, window, arm, reach, pose, max_steps):
+def ascend(
+    points, terms, frames, coefficients, window, arm, reach, pose, max_steps, precision, work
+):
     """Climb from `pose` (theta, x, y) in place, within the window; damped Newton steps.
 
-    Returns the value reached.
+    Ends where a step gains less than `precision` of the value. ``work`` (10, 3): scratch. Returns
+    the value reached.
     """
-    gradient, hessian = np.zeros(3), np.zeros((3, 3))
-    next_gradient, next_hessian = np.zeros(3), np.zeros((3, 3))
-    step, trial = np.zeros(3), np.zeros(3)
-    value = evaluate(
-        points, terms, frames, coefficients, pose[0], pose[1], pose[2], gradient, hessian
-    )
+    gradient, next_gradient, step, trial = work[0], work[1], work[2], work[3]
+    hessian, next_hessian = work[4:7], work[7:10]
+    value = evaluate(points, terms, frames, coefficients, pose, gradient, hessian)
     damping = abs(hessian[1, 1]) + abs(hessian[2, 2]) + 1e-9
     for _ in range(max_steps):
         if not _solve(hessian, damping, arm, gradient, step):
@@ -356,17 +394,7 @@ def ascend(points, terms, frames, coefficients, window, arm, reach, pose, max_st
             trial[k] = min(
                 max(pose[k] + step[k], window[k] - window[k + 3]), window[k] + window[k + 3]
             )
-        found = evaluate(
-            points,
-            terms,
-            frames,
-            coefficients,
-            trial[0],
-            trial[1],
-            trial[2],
-            next_gradient,
-            next_hessian,
-        )
+        found = evaluate(points, terms, frames, coefficients, trial, next_gradient, next_hessian)
         if found > value:
             gain = found - value
             value = found
@@ -374,7 +402,7 @@ def ascend(points, terms, frames, coefficients, window, arm, reach, pose, max_st
             gradient[:] = next_gradient
             hessian[:, :] = next_hessian
             damping *= 0.2
-            if gain <= 1e-10 * abs(value) or length < 1e-6 * reach:
+            if gain <= precision * abs(value) or length < 1e-6 * reach:
                 break
         else:
             damping *= 5.0
@@ -421,38 +449,119 @@ def _pop(keys, heap, count):
 
 
 @njit(cache=True, nogil=True)
-def _axis_to_split(child, arm, out):
+def _axis_to_split(box, arm, out):
     """Axis whose half width leaves most to be gained: 0 theta, 1 x, 2 y."""
     if out[0] < math.inf:
         rise_theta, rise_x, rise_y = out[2], out[3], out[4]
     else:
-        rise_theta, rise_x, rise_y = child[3] * arm, child[4], child[5]
+        rise_theta, rise_x, rise_y = box[3] * arm, box[4], box[5]
     if rise_theta >= rise_x and rise_theta >= rise_y:
         return 0
     return 1 if rise_x >= rise_y else 2
 
 
 @njit(cache=True, nogil=True)
+def _owner(found, count, box, arm, radius):
+    """Best optimum in whose neighbourhood a box lies entirely, -1 if there is none."""
+    owner = -1
+    for k in range(count):
+        if owner >= 0 and found[k, 0] <= found[owner, 0]:
+            continue
+        if abs(found[k, 2] - box[1]) + box[4] > radius:
+            continue
+        if abs(found[k, 3] - box[2]) + box[5] > radius:
+            continue
+        turn = abs(found[k, 1] - box[0]) % (2.0 * math.pi)
+        if arm * (min(turn, 2.0 * math.pi - turn) + box[3]) <= radius:
+            owner = k
+    return owner
+
+
+@njit(cache=True, nogil=True)
+def _note(found, counters, value, pose, arm, radius):
+    """Index of an optimum in the list, added if it is new; -1 where the list is full."""
+    count = counters[NUM_FOUND]
+    at = np.zeros(6)
+    at[:3] = pose
+    k = _owner(found, count, at, arm, radius)
+    if k < 0:
+        if count == found.shape[0]:
+            return -1
+        k = count
+        counters[NUM_FOUND] += 1
+        found[k, 0] = -math.inf
+        found[k, 4] = -math.inf
+    if value > found[k, 0]:
+        found[k, 0] = value
+        found[k, 1:4] = pose
+    return k
+
+
+@njit(cache=True, nogil=True)
+def _is_worth_a_climb(value, best, found, counters, box, arm, reach):
+    """Whether a centre is good, and not beside an optimum already known unless better than all."""
+    if value > best[0]:
+        return True
+    if value <= best[4] * best[0]:
+        return False
+    at = np.zeros(6)
+    at[:3] = box[:3]
+    return _owner(found, counters[NUM_FOUND], at, arm, reach) < 0
+
+
+@njit(cache=True, nogil=True)
 def run(
     points, terms, frames, levels, level_of, half_of, coefficients, bounds, windows, curvatures,
-    window, arm, reach, margin, small, gap, keep, max_boxes,
+    window, arm, reach, margin, small, gap, keep, radius, max_boxes,
     boxes, keys, heap, counters, best, found,
 ):  # fmt: skip
     """Search until the gap is closed or `max_boxes` more boxes were bounded.
 
     ``best``: lower bound, theta, x, y, ratio to the best from which on a centre is climbed from,
-    largest bound of anything discarded. Boxes are discarded whose bound is below ``keep`` times
-    the lower bound. ``found`` (F, 4): local optima met, a ring of value, theta, x, y. ``small``:
+    largest bound of a box that led to an optimum from outside its neighbourhood. ``found``
+    (F, 5): optima met: value, theta, x, y, largest bound of the boxes counted to it. ``small``:
     reach [m] of a box up to which curvature is tried.
+
+    Boxes are discarded once their bound is below ``keep`` times the lower bound. With ``radius``
+    = 0 the search ends when the gap is closed. With a positive one [m], every box above ``keep``
+    is followed until it is discarded or lies in the neighbourhood, of that radius, of an optimum;
+    what is still above as a box of a cell belongs to the optimum that a climb from there leads to.
     """
-    out = np.empty(5)
-    child = np.zeros(6)
-    pose = np.zeros(3)
+    out, work = np.empty(5), np.empty((10, 3))
+    child, pose = np.zeros(6), np.zeros(3)
+    cells = np.empty((4, points.shape[1]), np.int32)
+    near = 0.2 * reach
     budget = counters[NUM_BOXES] + max_boxes
     counters[STATUS] = DONE
     while counters[NUM_OPEN] > 0:
         top = heap[0]
-        if keys[top] <= best[0] or keys[top] - best[0] <= gap * keys[top]:
+        if radius > 0.0:
+            if keys[top] <= keep * best[0]:
+                return
+            owner = _owner(found, counters[NUM_FOUND], boxes[top], arm, radius)
+            size = max(boxes[top, 3] * arm, max(boxes[top, 4], boxes[top, 5]))
+            is_small = size <= 0.2 * reach
+            if owner < 0 and is_small:
+                pose[:] = boxes[top, :3]
+                value = ascend(
+                    points, terms, frames, coefficients, window, arm, reach, pose, 50, 1e-6, work
+                )
+                owner = _note(found, counters, value, pose, arm, near)
+                if owner < 0:
+                    counters[STATUS] = FOUND_FULL
+                    return
+                best[5] = max(best[5], keys[top])
+            # Around the best, the bound of all is the bound; around others it is worth some boxes.
+            if owner >= 0 and (
+                is_small
+                or found[owner, 0] >= (1.0 - gap) * best[0]
+                or keys[top] * (1.0 - gap) <= found[owner, 0]
+            ):
+                found[owner, 4] = max(found[owner, 4], keys[top])
+                _pop(keys, heap, counters[NUM_OPEN])
+                counters[NUM_OPEN] -= 1
+                continue
+        elif keys[top] <= best[0] or keys[top] - best[0] <= gap * keys[top]:
             return
         if counters[NUM_BOXES] >= budget:
             counters[STATUS] = CHUNK_ENDED
@@ -469,29 +578,29 @@ def run(
         centre = child[axis]
         for side in range(2):
             child[axis] = centre + (2 * side - 1) * child[axis + 3]
+            floor = min(best[0], keep * best[0])
             upper = bound_first(
-                points, terms, frames, levels, level_of, half_of, bounds, windows, child
-            )
+                points, terms, frames, levels, level_of, half_of, bounds, windows, child,
+                floor - margin, cells,
+            )  # fmt: skip
             upper = min(parent_key, upper + margin)
             counters[NUM_BOXES] += 1
             out[0] = math.inf
-            floor = min(best[0], keep * best[0])
             if upper > floor and child[3] * arm + max(child[4], child[5]) <= small:
-                bound_second(points, terms, frames, half_of, coefficients, curvatures, child, out)
+                bound_second(
+                    points, terms, frames, half_of, coefficients, curvatures, child, out, cells
+                )
                 counters[NUM_SECOND] += 1
                 upper = min(upper, out[0] + margin)
-                if out[1] > best[0]:
-                    best[0] = out[1]
-                    best[1:4] = child[:3]
-                if upper > best[0] and out[1] > best[4] * best[0]:
+                if upper > floor and _is_worth_a_climb(
+                    out[1], best, found, counters, child, arm, reach
+                ):
                     pose[:] = child[:3]
                     value = ascend(
-                        points, terms, frames, coefficients, window, arm, reach, pose, 30
-                    )
-                    at = counters[NUM_FOUND] % found.shape[0]
-                    found[at, 0] = value
-                    found[at, 1:4] = pose
-                    counters[NUM_FOUND] += 1
+                        points, terms, frames, coefficients, window, arm, reach, pose, 30, 1e-8,
+                        work,
+                    )  # fmt: skip
+                    _note(found, counters, value, pose, arm, near)
                     if value > best[0]:
                         best[0] = value
                         best[1:4] = pose
@@ -499,8 +608,10 @@ def run(
                     else:
                         # The more climbs fail, the better a centre has to be for the next.
                         best[4] += 0.1 * (1.0 - best[4])
+                if out[1] > best[0]:
+                    best[0] = out[1]
+                    best[1:4] = child[:3]
             if upper <= floor:
-                best[5] = max(best[5], upper)
                 continue
             slot = heap[counters[NUM_OPEN]]
             boxes[slot, :6] = child
