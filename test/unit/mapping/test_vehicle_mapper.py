@@ -110,6 +110,17 @@ def test_matching_and_loops_beat_dead_reckoning(recording, mapped):
     assert np.mean(error_m(mapped[0], truth)) < 0.3 * np.mean(error_m(blind, truth))
 
 
+def test_particles_beat_dead_reckoning_and_repeat_themselves(recording):
+    events, truth = recording
+    config = replace(CONFIG, estimator="particle_filter")
+    blind, _ = run(replace(CONFIG, estimator="dead_reckoning"), events)
+    first, _ = run(config, events)
+    again, _ = run(config, events)
+    assert np.mean(error_m(first, truth)) < 0.4 * np.mean(error_m(blind, truth))
+    assert first.trajectory()[1].tobytes() == again.trajectory()[1].tobytes()
+    assert first.diagnostics()["num_loops"] > 0
+
+
 def test_submaps_count_up_and_revise_only_themselves(mapped):
     mapper, submaps = mapped
     sequences = [s.sequence for s in submaps]

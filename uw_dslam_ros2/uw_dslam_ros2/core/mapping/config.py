@@ -8,7 +8,14 @@ from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.navigation.config import NavigationConfig
 from uw_dslam_ros2.core.sonar.config import SonarConfig
 
-__all__ = ["LoopConfig", "MatchConfig", "OccupancyConfig", "SubmapConfig", "VehicleMapperConfig"]
+__all__ = [
+    "LoopConfig",
+    "MatchConfig",
+    "OccupancyConfig",
+    "ParticleConfig",
+    "SubmapConfig",
+    "VehicleMapperConfig",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +72,7 @@ class LoopConfig(Config):
     """Loop closures between a vehicle's own submaps, and its pose graph."""
 
     is_enabled: bool = setting(True, doc="close loops inside the vehicle")
-    max_candidates: int = setting(6, 0, 1000, "earlier submaps tried for each new one")
+    max_candidates: int = setting(4, 0, 1000, "earlier submaps tried for each new one")
     search_sigma: float = setting(
         3.0, 0.5, 10.0, "search window in standard deviations of the graph"
     )
@@ -73,18 +80,26 @@ class LoopConfig(Config):
     max_window_rad: float = setting(
         0.35, 0.01, 3.2, "largest half width of the search window in yaw"
     )
-    min_overlap: float = setting(0.5, 0.0, 1.0, "share of the points that must meet the other map")
-    min_lead: float = setting(
-        0.05, 0.0, 1.0, "lead over the best other pose, as a share of the score"
+    min_overlap: float = setting(
+        0.3, 0.0, 1.0, "share of the points that must meet the other map to refine its pose"
     )
     max_conflict: float = setting(
-        0.1, 0.0, 1.0, "share of the points that may fall on free water of the other map"
-    )
-    num_context: int = setting(
-        0, 0, 20, "neighbouring submaps that are matched along with each of the two"
+        0.2, 0.0, 1.0, "particles: share of the points on free water above which nothing matches"
     )
     min_points: int = setting(60, 3, 100000, "submaps with fewer points are not matched")
     max_points: int = setting(600, 10, 100000, "points of a submap that are matched")
+
+
+@dataclass(frozen=True, slots=True)
+class ParticleConfig(Config):
+    """The particle filter; where it looks for known submaps the settings of loops say."""
+
+    num_particles: int = setting(60, 2, 10000, "particles")
+    min_effective_share: float = setting(
+        0.5, 0.0, 1.0, "resampling where the effective number falls below this share"
+    )
+    max_points: int = setting(250, 10, 100000, "points of a submap that are matched")
+    seed: int = setting(0, 0, 2**31 - 1, "same seed and same messages, same map")
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +108,9 @@ class VehicleMapperConfig(Config):
 
     estimator: str = setting(
         "scan_matching",
-        choices=("dead_reckoning", "scan_matching"),
-        doc="who places the pings: dead reckoning alone, or scan matching and loop closures",
+        choices=("dead_reckoning", "scan_matching", "particle_filter"),
+        doc="who places the pings: dead reckoning alone, scan matching with loop closures in a "
+        "graph of submaps, or scan matching with a particle filter over submaps",
     )
     sonar: SonarConfig = setting(SonarConfig())
     navigation: NavigationConfig = setting(NavigationConfig())
@@ -102,6 +118,7 @@ class VehicleMapperConfig(Config):
     submap: SubmapConfig = setting(SubmapConfig())
     match: MatchConfig = setting(MatchConfig())
     loop: LoopConfig = setting(LoopConfig())
+    particles: ParticleConfig = setting(ParticleConfig())
     settle_s: float = setting(
         0.1,
         0.0,

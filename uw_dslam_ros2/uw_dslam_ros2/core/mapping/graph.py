@@ -14,6 +14,7 @@ __all__ = ["Between", "SubmapGraph"]
 
 FloatArray = NDArray[np.float64]
 _TINY_SIGMA = 1e-3
+_BELIEVED = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +36,7 @@ class SubmapGraph:
     def __init__(self) -> None:
         self._odometry: list[Between] = []
         self._loops: list[Between] = []
-        self._headings: dict[int, tuple[float, float]] = {}
+        self._anchor = np.eye(3) * _TINY_SIGMA**2
         self._poses: list[SE2] = []
         self.loop_weights: FloatArray = np.empty(0)
 
@@ -49,9 +50,31 @@ class SubmapGraph:
         """All loops, believed or not."""
         return list(self._loops)
 
-    def add_first(self, T_odom_submap: SE2) -> None:
-        """Begin with the first submap, which stays where it is."""
+    @property
+    def num_loops(self) -> int:
+        """Loops, believed or not."""
+        return len(self._loops)
+
+    @property
+    def num_loops_believed(self) -> int:
+        """Loops that act on the poses."""
+        return int((self.loop_weights > _BELIEVED).sum())
+
+    def add_first(self, T_odom_submap: SE2, covariance: FloatArray) -> None:
+        """Begin with the first submap, which stays where it is; covariance (3, 3) in odom."""
         self._poses = [T_odom_submap]
+        rotation = np.eye(3)
+        rotation[:2, :2] = T_odom_submap.rotation().T
+        self._anchor = rotation @ covariance @ rotation.T + np.eye(3) * _TINY_SIGMA**2
+
+    def covariance(self) -> FloatArray:
+        """Covariance (3, 3) of the newest submap's pose in odom, order x, y, yaw."""
+        graph, values = self._factors(is_weighted=True)
+        newest = len(self._poses) - 1
+        rotation = np.eye(3)
+        rotation[:2, :2] = self._poses[newest].rotation()
+        own = gtsam.Marginals(graph, values).marginalCovariance(newest)
+        return np.asarray(rotation @ own @ rotation.T)
 
     def add_next(self, T_previous_new: SE2, covariance: FloatArray) -> None:
         """Append a submap by odometry; covariance (3, 3) in the previous submap's frame."""
@@ -59,10 +82,6 @@ class SubmapGraph:
         information = _rotated_inverse(covariance, T_previous_new)
         self._odometry.append(Between(target, target + 1, T_previous_new, information))
         self._poses.append(self._poses[-1] @ T_previous_new)
-
-    def add_heading(self, index: int, yaw_rad: float, sigma_rad: float) -> None:
-        """An absolute yaw (in odom) of a submap."""
-        self._headings[index] = (yaw_rad, sigma_rad)
 
     def add_loop(
         self, target: int, source: int, T_target_source: SE2, information: FloatArray
@@ -76,7 +95,7 @@ class SubmapGraph:
 
     def relative(self, target: int, source: int) -> tuple[SE2, FloatArray]:
         """``T_target_source`` now and its covariance (3, 3) in the target frame."""
-        graph, values = self._factors(with_loops=True)
+        graph, values = self._factors(is_weighted=True)
         marginals = gtsam.Marginals(graph, values)
         keys = gtsam.KeyVector([target, source])
         joint = marginals.jointMarginalCovariance(keys)
@@ -93,7 +112,7 @@ class SubmapGraph:
 
     def optimize(self) -> bool:
         """Solve; True if any submap moved by more than a hundredth of a metre or milliradian."""
-        graph, values = self._factors(with_loops=True)
+        graph, values = self._factors(is_weighted=False)
         num_known = graph.size() - len(self._loops)
         if self._loops:
             parameters = gtsam.GncLMParams()
@@ -113,28 +132,33 @@ class SubmapGraph:
         self._poses = new
         return moved
 
-    def _factors(self, with_loops: bool) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    def _factors(self, is_weighted: bool) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Graph and present poses; weighted: the loops as the last solution believed them."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for i, pose in enumerate(self._poses):
             values.insert(i, gtsam.Pose2(pose.x, pose.y, pose.yaw))
         anchor = self._poses[0]
-        sigma = np.array([_TINY_SIGMA, _TINY_SIGMA, _TINY_SIGMA])
         graph.add(
             gtsam.PriorFactorPose2(
                 0,
                 gtsam.Pose2(anchor.x, anchor.y, anchor.yaw),
-                gtsam.noiseModel.Diagonal.Sigmas(sigma),
+                gtsam.noiseModel.Gaussian.Covariance(self._anchor),
             )
         )
-        for index, (yaw, yaw_sigma) in sorted(self._headings.items()):
-            heading = gtsam.noiseModel.Isotropic.Sigma(1, yaw_sigma)
-            graph.add(gtsam.PoseRotationPrior2D(index, gtsam.Rot2(yaw), heading))
-        for edge in self._odometry + (self._loops if with_loops else []):
+        weights = [1.0] * len(self._loops)
+        if is_weighted:
+            known = min(len(self.loop_weights), len(weights))
+            weights[:known] = self.loop_weights[:known].tolist()
+        edges = [(edge, 1.0) for edge in self._odometry]
+        for edge, weight in edges + list(zip(self._loops, weights, strict=True)):
             T = edge.T_target_source
-            noise = gtsam.noiseModel.Gaussian.Information(edge.information)
+            information = weight * edge.information + 1e-9 * np.eye(3)
             graph.add(
                 gtsam.BetweenFactorPose2(
-                    edge.target, edge.source, gtsam.Pose2(T.x, T.y, T.yaw), noise
+                    edge.target,
+                    edge.source,
+                    gtsam.Pose2(T.x, T.y, T.yaw),
+                    gtsam.noiseModel.Gaussian.Information(information),
                 )
             )
         return graph, values

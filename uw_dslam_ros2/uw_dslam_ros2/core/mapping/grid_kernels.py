@@ -110,7 +110,7 @@ def _run_state(dx0, dx1, dy, cos, sin, num_directions, least, most, level_of):  
 
 @njit(cache=True, nogil=True)
 def _water_window(limit, sonar_x, sonar_y, cos, sin):  # type: ignore[no-untyped-def]
-    """Largest free range and the box around all free water: reach, low x, high x, low y, high y."""
+    """Largest free range and the box around all free water: low x, high x, low y, high y."""
     num_directions = limit.shape[0]
     reach = 0.0
     low_x = high_x = sonar_x
@@ -132,7 +132,8 @@ def _water_window(limit, sonar_x, sonar_y, cos, sin):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True)
 def _add_water(  # type: ignore[no-untyped-def]
-    evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin, limit, free,
+    evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
+    limit, free,
 ):  # fmt: skip
     """Take `free` from every cell nearer than its direction's `limit` (a squared range).
 
@@ -196,8 +197,8 @@ def add_ping(  # type: ignore[no-untyped-def]
     """Add one ping's evidence: at most one contribution to each cell, echo before water.
 
     Points (N, 2) are in the sonar's frame; cell (0, 0) has its outer corner at `origin` cells from
-    the frame's zero. Cells outside the grid are left out. `echo` (R, C) int16 is scratch: zeros in,
-    zeros out; making it anew for each ping would cost more than the ping.
+    the frame's zero. Cells outside the grid are left out. `echo` (R, C) int16 is scratch: zeros
+    in, zeros out; making it anew for each ping would cost more than the ping.
     """
     num_rows, num_cols = evidence.shape
     cos, sin = np.cos(sonar_yaw), np.sin(sonar_yaw)

@@ -1,4 +1,4 @@
-"""Loop closures between a vehicle's own submaps."""
+"""Loop closures between a vehicle's own submaps: proposed by the graph, judged by the engine."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ from uw_dslam_ros2.core.mapping.matcher import (
     match_points,
     thin,
 )
-from uw_dslam_ros2.core.mapping.occupancy import UNITS_PER_NAT, PackedEvidence
+from uw_dslam_ros2.core.mapping.rivals import has_rival
 from uw_dslam_ros2.core.mapping.section import ClosedSection
+from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, register_grids
+from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["conflict", "find_loops"]
+__all__ = ["find_loops", "with_bend"]
 
 FloatArray = NDArray[np.float64]
-_COARSEST = 8.0
-_SURELY_FREE_NATS = 0.6
 # A match takes a submap as rigid; on average half of its own drift lies between its points.
 _BEND_SHARE = 0.25
+# The proof matters less than the verdict here: the window is small and many pairs are tried.
+_DIGITS = 6
+_REGISTRATION = GridRegistrationConfig(max_boxes=20_000)
 
 
 def find_loops(
@@ -34,23 +37,14 @@ def find_loops(
     source = len(sections) - 1
     if len(sections[source].points) < config.loop.min_points:
         return False
-    points, weight = _surroundings(
-        graph, sections, source, source - config.loop.num_context, source
-    )
-    stride = max(1, -(-len(points) // config.loop.max_points))
     found = False
     for target in _candidates(graph, sections, source, config):
         T_target_source, covariance = graph.relative(target, source)
-        # The source's own context must not match itself.
-        last = min(target + config.loop.num_context, source - config.loop.num_context - 1)
-        known, support = _surroundings(
-            graph, sections, target, target - config.loop.num_context, max(target, last)
+        answer = _verified(
+            sections[target], sections[source], Prior(T_target_source, covariance), config
         )
-        prior = Prior(T_target_source, covariance)
-        match = _match(known, support, points[::stride], weight[::stride], prior, config)
-        if _is_believed(match, sections[target], sections[source], config):
-            information = _with_bend(match, sections[target], sections[source])
-            graph.add_loop(target, source, match.T_target_source, information)
+        if answer is not None:
+            graph.add_loop(target, source, *answer)
             found = True
     return graph.optimize() if found else False
 
@@ -62,7 +56,7 @@ def _candidates(
     poses = graph.poses
     here = poses[source].apply(sections[source].center)
     scored = []
-    for target in range(source - 1 - config.loop.num_context):
+    for target in range(source - 1):
         if len(sections[target].points) < config.loop.min_points:
             continue
         distance = float(np.linalg.norm(poses[target].apply(sections[target].center) - here))
@@ -73,81 +67,67 @@ def _candidates(
     return [target for _, target in scored[: config.loop.max_candidates]]
 
 
-def _surroundings(
-    graph: SubmapGraph, sections: list[ClosedSection], center: int, first: int, last: int
-) -> tuple[FloatArray, FloatArray]:
-    """Points (N, 2) and weights of submaps first to last in the frame of `center`.
+def _verified(
+    target: ClosedSection, source: ClosedSection, prior: Prior, config: VehicleMapperConfig
+) -> tuple[SE2, FloatArray] | None:
+    """``T_target_source`` and its information (3, 3), in the target frame; None if refused.
 
-    One short submap often fits in several places; with its neighbours it is distinct.
+    The registration engine compares walls and free water within the window that the graph
+    allows; where the same walls would fit a period further, nothing is believed. The mapper's
+    own matcher, which knows points and not cells, then refines the pose.
     """
-    poses = graph.poses
-    points, weight = [], []
-    for index in range(max(first, 0), min(last, len(sections) - 1) + 1):
-        T_center_here = poses[center].inverse() @ poses[index]
-        points.append(T_center_here.apply(sections[index].points))
-        weight.append(sections[index].weight)
-    return np.vstack(points), np.concatenate(weight)
-
-
-def _match(
-    known: FloatArray,
-    support: FloatArray,
-    points: FloatArray,
-    weight: FloatArray,
-    prior: Prior,
-    config: VehicleMapperConfig,
-) -> Match:
-    """Match points against known ones in a window around a prior."""
-    sigma = np.sqrt(np.diag(prior.covariance)) * config.loop.search_sigma
+    loop = config.loop
+    sigma = np.sqrt(np.diag(prior.covariance)) * loop.search_sigma
     fine = config.match.sigma_m
-    half_width = (
-        float(np.clip(sigma[0], 2.0 * fine, config.loop.max_window_m)),
-        float(np.clip(sigma[1], 2.0 * fine, config.loop.max_window_m)),
-        float(np.clip(sigma[2], 0.05, config.loop.max_window_rad)),
+    window = PriorWindow(
+        prior.T_target_source,
+        float(np.clip(sigma[:2].max(), 4.0 * fine, loop.max_window_m)),
+        float(np.clip(sigma[2], 0.05, loop.max_window_rad)),
     )
-    coarse = float(np.clip(max(half_width[:2]) / 8.0, fine, _COARSEST * fine))
-    sigmas = [coarse]
-    while sigmas[-1] > 1.5 * fine:
-        sigmas.append(max(0.5 * sigmas[-1], fine))
-    fields = [LikelihoodField(known, support, s) for s in sigmas]
-    # The window already says where to look; inside it the prior only breaks ties, so it is wide.
-    spread = prior.covariance * 4.0 + np.diag([fine**2, fine**2, 1e-4])
-    source, source_weight = thin(points, 1.0 - np.exp(-weight), fine)
+    log_odds_max = config.occupancy.log_odds_max
+    judged = register_grids(
+        source.evidence.unpacked().to_occupancy(log_odds_max),
+        target.evidence.unpacked().to_occupancy(log_odds_max),
+        _REGISTRATION,
+        prior=window,
+    )
+    if not (judged.is_accepted and _is_within(judged.T_target_source, window)):
+        return None
+    if has_rival(target, source, judged.T_target_source, prior, window.half_width_m, fine):
+        return None
+    # The engine's last digits depend on how memory is aligned; the mapper's must not.
+    T_target_source = SE2.from_array(np.round(judged.T_target_source.as_array(), _DIGITS))
+    covariance = np.round(judged.covariance, _DIGITS) + np.diag([fine**2, fine**2, 1e-5])
+    match = _refined(target, source, Prior(T_target_source, covariance), config)
+    information = np.linalg.inv(covariance)
+    if match.overlap >= loop.min_overlap:
+        T_target_source, information = match.T_target_source, match.information
+    rotation = np.eye(3)
+    rotation[:2, :2] = T_target_source.rotation()
+    bend = target.drift + rotation @ source.drift @ rotation.T
+    return T_target_source, with_bend(information, bend)
+
+
+def _is_within(T_target_source: SE2, window: PriorWindow) -> bool:
+    distance, turn = T_target_source.distance_to(window.T_target_source)
+    return distance <= 1.5 * window.half_width_m and turn <= 1.5 * window.half_width_rad
+
+
+def _refined(
+    target: ClosedSection, source: ClosedSection, prior: Prior, config: VehicleMapperConfig
+) -> Match:
+    """Match of the points near a pose that is known to some decimetres."""
+    fine = config.match.sigma_m
+    fields = [LikelihoodField(target.points, target.weight, s) for s in (2.0 * fine, fine)]
+    points, weight = thin(source.points, 1.0 - np.exp(-source.weight), fine)
+    stride = max(1, -(-len(points) // config.loop.max_points))
     return match_points(
-        fields, source, source_weight, Prior(prior.T_target_source, spread), half_width,
+        fields, points[::stride], weight[::stride], prior, (4.0 * fine, 4.0 * fine, 0.03),
         config.match.information_share,
     )  # fmt: skip
 
 
-def _with_bend(match: Match, target: ClosedSection, source: ClosedSection) -> FloatArray:
-    """Information (3, 3) of a match, less what the two submaps may be bent."""
-    rotation = np.eye(3)
-    rotation[:2, :2] = match.T_target_source.rotation()
-    bend = target.drift + rotation @ source.drift @ rotation.T
+def with_bend(information: FloatArray, bend: FloatArray) -> FloatArray:
+    """Information (3, 3) of a match, less what the submaps may be bent, by their drift (3, 3)."""
     # (L^-1 + B)^-1 without inverting L, which may be singular.
-    information = match.information
     return information @ np.linalg.inv(np.eye(3) + _BEND_SHARE * bend @ information)
-
-
-def _is_believed(
-    match: Match, target: ClosedSection, source: ClosedSection, config: VehicleMapperConfig
-) -> bool:
-    """Whether overlap, lead over rivals and the water between the walls allow it."""
-    if match.overlap < config.loop.min_overlap or match.lead < config.loop.min_lead:
-        return False
-    there = conflict(target.evidence, source.points, match.T_target_source)
-    back = conflict(source.evidence, target.points, match.T_target_source.inverse())
-    return max(there, back) <= config.loop.max_conflict
-
-
-def conflict(evidence: PackedEvidence, points: FloatArray, T_grid_points: SE2) -> float:
-    """Share of the points (N, 2) that fall on surely free water of a grid."""
-    if len(points) == 0:
-        return 0.0
-    grid = evidence.unpacked()
-    cells = np.floor(T_grid_points.apply(points) / grid.resolution_m).astype(np.int64)
-    rows, cols = cells[:, 1] - grid.row, cells[:, 0] - grid.col
-    inside = (rows >= 0) & (cols >= 0)
-    inside &= (rows < grid.evidence.shape[0]) & (cols < grid.evidence.shape[1])
-    free = grid.evidence[rows[inside], cols[inside]] < -_SURELY_FREE_NATS * UNITS_PER_NAT
-    return float(free.sum()) / len(points)

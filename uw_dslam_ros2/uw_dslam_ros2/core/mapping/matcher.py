@@ -93,6 +93,14 @@ class LikelihoodField:
         """Sums of weighted values under points (N, 2) at each pose (K, 3)."""
         return score_poses(self.values, *self.origin, self.cell_m, points, weight, poses)
 
+    def values_at(self, points: FloatArray) -> FloatArray:
+        """Values (N,) of the cells that hold points (N, 2); 0 outside."""
+        cells = np.floor((points - self.origin) / self.cell_m).astype(np.int64)
+        inside = (cells >= 0).all(axis=1) & (cells < np.array(self.values.shape)[::-1]).all(axis=1)
+        result = np.zeros(len(points))
+        result[inside] = self.values[cells[inside, 1], cells[inside, 0]]
+        return result
+
     def window(
         self,
         points: FloatArray,
@@ -186,7 +194,7 @@ def match_points(
         field, source, weight, pose, prior_information, information_share, float(scale)
     )
     T_target_source = SE2.from_array(pose)
-    single = _point_values(field, source, pose)
+    single = field.values_at(T_target_source.apply(source))
     return Match(
         T_target_source,
         information,
@@ -194,15 +202,6 @@ def match_points(
         value / len(source),
         lead,
     )
-
-
-def _point_values(field: LikelihoodField, source: FloatArray, pose: FloatArray) -> FloatArray:
-    moved = SE2.from_array(pose).apply(source)
-    cells = np.floor((moved - field.origin) / field.cell_m).astype(np.int64)
-    inside = (cells >= 0).all(axis=1) & (cells < np.array(field.values.shape)[::-1]).all(axis=1)
-    result = np.zeros(len(source))
-    result[inside] = field.values[cells[inside, 1], cells[inside, 0]]
-    return result
 
 
 def _difference(pose: FloatArray, mean: FloatArray) -> FloatArray:

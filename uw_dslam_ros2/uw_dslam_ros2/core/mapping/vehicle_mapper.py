@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.graph import SubmapGraph
+from uw_dslam_ros2.core.mapping.covariances import composed_covariance
+from uw_dslam_ros2.core.mapping.estimators import make_estimator
 from uw_dslam_ros2.core.mapping.local_map import LocalMap
-from uw_dslam_ros2.core.mapping.loops import find_loops
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.occupancy import fuse
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
@@ -48,7 +48,7 @@ class VehicleMapper:
         self._config = config
         self._vehicle_id = vehicle_id
         self._navigation = NavigationFilter(config.navigation)
-        self._graph = SubmapGraph()
+        self._estimator = make_estimator(config)
         self._local_map = LocalMap(config.match)
         self._closed: list[ClosedSection] = []
         self._open: OpenSection | None = None
@@ -166,9 +166,9 @@ class VehicleMapper:
         if self._open is None:
             if self._closed:
                 last = self._closed[-1]
-                return self._graph.poses[-1] @ SE2.from_array(last.trajectory[-1])
+                return self._estimator.poses[-1] @ SE2.from_array(last.trajectory[-1])
             return self._navigation.pose_at(stamp_ns)[0]
-        return self._graph.poses[-1] @ self._navigation.relative_at(stamp_ns)[0]
+        return self._estimator.poses[-1] @ self._navigation.relative_at(stamp_ns)[0]
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -176,7 +176,13 @@ class VehicleMapper:
         stamp_ns = self._navigation.stamp_ns
         if stamp_ns is None:
             raise InvalidInputError("there is no pose yet, expected navigation messages first")
-        return self._navigation.pose_at(stamp_ns)[1]
+        if self._estimator.num_loops_believed == 0:
+            return self._navigation.pose_at(stamp_ns)[1]
+        T_odom_submap = self._estimator.poses[-1]
+        T_submap_base, own = SE2(), np.zeros((3, 3))
+        if self._open is not None:
+            T_submap_base, own = self._navigation.relative_at(stamp_ns)
+        return composed_covariance(T_odom_submap, self._estimator.covariance(), T_submap_base, own)
 
     @property
     def velocity(self) -> tuple[FloatArray, float]:
@@ -193,7 +199,7 @@ class VehicleMapper:
             parts.append((self._open.stamps_ns, self._open.poses))
         stamps = [np.empty(0, np.int64)]
         poses = [np.empty((0, 3))]
-        for T_odom_submap, (part_stamps, part) in zip(self._graph.poses, parts, strict=False):
+        for T_odom_submap, (part_stamps, part) in zip(self._estimator.poses, parts, strict=False):
             moved = np.column_stack(
                 [T_odom_submap.apply(part[:, :2]), part[:, 2] + T_odom_submap.yaw]
             )
@@ -212,7 +218,7 @@ class VehicleMapper:
             parts.append(self._open.grid.trimmed())
         if not parts:
             raise InvalidInputError("there is no map yet, expected a ping with navigation first")
-        poses = self._graph.poses
+        poses = self._estimator.poses
         return fuse(zip(parts, poses, strict=True), self._config.occupancy.log_odds_max)
 
     def diagnostics(self) -> dict[str, float | int | str]:
@@ -228,8 +234,8 @@ class VehicleMapper:
             **self._counts,
             "num_pings_waiting": len(self._pending),
             "num_submaps": len(self._closed),
-            "num_loops": len(self._graph.loops),
-            "num_loops_believed": int((self._graph.loop_weights > 0.5).sum()),
+            "num_loops": self._estimator.num_loops,
+            "num_loops_believed": self._estimator.num_loops_believed,
             "velocity_age_s": age_s,
             "num_navigation_late": navigation.num_late,
             "num_navigation_invalid": navigation.num_invalid,
@@ -301,9 +307,9 @@ class VehicleMapper:
         index = len(self._closed)
         if T_previous_new is None or covariance is None:
             covariance = odom_covariance
-            self._graph.add_first(T_odom_base)
+            self._estimator.add_first(T_odom_base, odom_covariance)
         else:
-            self._graph.add_next(T_previous_new, covariance)
+            self._estimator.add_next(T_previous_new, covariance)
             self._local_map.rebase(T_previous_new.inverse())
             if self._last_key is not None:
                 self._last_key = (self._last_key[0], T_previous_new.inverse() @ self._last_key[1])
@@ -346,17 +352,16 @@ class VehicleMapper:
     def _close(self, drift: FloatArray) -> list[Submap]:
         """Close the open submap, look for loops, and say which submaps are new or have moved."""
         assert self._open is not None
-        poses = self._graph.poses
+        poses = self._estimator.poses
         section = self._open.close(poses[-1], drift)
         self._closed.append(section)
         self._open = None
-        if self._config.estimator == "scan_matching" and self._config.loop.is_enabled:
-            find_loops(self._graph, self._closed, self._config)
+        self._estimator.settle(self._closed)
         return self._issue(new=section)
 
     def _issue(self, new: ClosedSection | None = None) -> list[Submap]:
         issued = []
-        for section, T_odom_submap in zip(self._closed, self._graph.poses, strict=False):
+        for section, T_odom_submap in zip(self._closed, self._estimator.poses, strict=False):
             distance, turn = section.T_odom_issued.distance_to(T_odom_submap)
             has_moved = distance > _REISSUE_M or turn > _REISSUE_RAD
             if section is not new:

@@ -1,0 +1,104 @@
+"""Where else a submap would fit: agreement of echoes with another submap's walls and water."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior
+from uw_dslam_ros2.core.mapping.occupancy import UNITS_PER_NAT, PackedEvidence, SparseEvidence
+from uw_dslam_ros2.core.mapping.section import ClosedSection
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["conflict", "has_rival"]
+
+FloatArray = NDArray[np.float64]
+_SURELY_FREE_NATS = 0.6
+_MEETS = 0.25
+_MAX_POINTS = 400
+_MAX_PEAKS = 12
+# A rival explains at least half as many echoes, and contradicts hardly more of them. The overlap
+# itself is no evidence: on periodic piers it is largest wherever the two submaps begin together.
+_LEAST_SHARE = 0.5
+_SLACK = 0.08
+
+
+def conflict(evidence: PackedEvidence, points: FloatArray, T_grid_points: SE2) -> float:
+    """Share of the points (N, 2) that fall on surely free water of a grid."""
+    if len(points) == 0:
+        return 0.0
+    return float(_on_water(evidence.unpacked(), points, T_grid_points).sum()) / len(points)
+
+
+def has_rival(
+    target: ClosedSection,
+    source: ClosedSection,
+    T_target_source: SE2,
+    prior: Prior,
+    half_width_m: float,
+    sigma_m: float,
+) -> bool:
+    """Whether another pose near the prior explains the source's echoes about as well.
+
+    Poses with the yaw of ``T_target_source`` are tried, within `half_width_m` of the prior's mean
+    and farther than six `sigma_m` from the pose itself. How well a pose explains what is in both
+    submaps is the number of echoes that meet echoes, over these and those on free water.
+    """
+    stride = max(1, -(-len(source.points) // _MAX_POINTS))
+    points = source.points[::stride]
+    field = LikelihoodField(target.points, target.weight, 2.0 * sigma_m)
+    grid = target.evidence.unpacked()
+    best_met, best_against = _agreement(field, grid, points, T_target_source)
+    center = prior.T_target_source.as_array()
+    center[2] = T_target_source.yaw
+    step = 2.0 * sigma_m
+    num = int(np.ceil(half_width_m / step))
+    scores = field.window(
+        points, np.ones(len(points)), center, np.array([num, num, 0]), step, 1.0
+    )[0]
+    for offset in _peaks(scores, num, step):
+        pose = SE2(float(center[0] + offset[0]), float(center[1] + offset[1]), float(center[2]))
+        if pose.distance_to(T_target_source)[0] <= 6.0 * sigma_m:
+            continue
+        met, against = _agreement(field, grid, points, pose)
+        is_large = met >= _LEAST_SHARE * best_met
+        if is_large and _quality(met, against) >= _quality(best_met, best_against) - _SLACK:
+            return True
+    return False
+
+
+def _peaks(scores: FloatArray, num: int, step: float) -> FloatArray:
+    """Offsets (K, 2) [x, y] of the best local maxima, best first, apart from each other."""
+    left = scores.copy()
+    peaks = []
+    for _ in range(_MAX_PEAKS):
+        row, col = np.unravel_index(int(np.argmax(left)), left.shape)
+        if left[row, col] <= 0.0:
+            break
+        peaks.append(((int(col) - num) * step, (int(row) - num) * step))
+        left[max(0, row - 3) : row + 4, max(0, col - 3) : col + 4] = 0.0
+    return np.array(peaks).reshape(-1, 2)
+
+
+def _quality(met: int, against: int) -> float:
+    return met / max(1, met + against)
+
+
+def _agreement(
+    field: LikelihoodField, grid: SparseEvidence, points: FloatArray, T_grid_points: SE2
+) -> tuple[int, int]:
+    """How many points meet echoes, and how many of the others are on free water."""
+    meets = field.values_at(T_grid_points.apply(points)) > _MEETS
+    is_on_water = _on_water(grid, points, T_grid_points)
+    return int(meets.sum()), int((is_on_water & ~meets).sum())
+
+
+def _on_water(grid: SparseEvidence, points: FloatArray, T_grid_points: SE2) -> NDArray[np.bool_]:
+    cells = np.floor(T_grid_points.apply(points) / grid.resolution_m).astype(np.int64)
+    rows, cols = cells[:, 1] - grid.row, cells[:, 0] - grid.col
+    inside = (rows >= 0) & (cols >= 0)
+    inside &= (rows < grid.evidence.shape[0]) & (cols < grid.evidence.shape[1])
+    result = np.zeros(len(points), np.bool_)
+    evidence = grid.evidence[rows[inside], cols[inside]]
+    result[inside] = evidence < -_SURELY_FREE_NATS * UNITS_PER_NAT
+    return result
