@@ -7,6 +7,7 @@ from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,
+    MapProvenance,
     MatchRequest,
     SubmapRecord,
     SubmapState,
@@ -15,6 +16,7 @@ from uw_dslam_ros2.core.merging.types import (
 __all__ = [
     "Constraint",
     "ConstraintKind",
+    "MapProvenance",
     "MapQueue",
     "MapQueueConfig",
     "MatchRequest",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +13,7 @@ from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["Answer", "Match", "MatchKey", "numbers_of"]
+__all__ = ["Answer", "AnswerBook", "Match", "MatchKey", "numbers_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -57,6 +58,19 @@ class Answer:
         is_unsure = self.verdict in (Verdict.ACCEPTED, Verdict.NOT_ENOUGH_OVERLAP)
         return is_unsure and self.is_inside(self.match.prior)
 
+    def is_about(self, prior: PriorWindow) -> bool:
+        """Whether nearly this window was searched: the middle of each lies well in the other."""
+        own = self.match.prior
+        if own is None:
+            return False
+        one, other = own.T_target_source, prior.T_target_source
+        reach_m = 0.5 * min(own.half_width_m, prior.half_width_m)
+        reach_rad = 0.5 * min(own.half_width_rad, prior.half_width_rad)
+        return (
+            max(abs(one.x - other.x), abs(one.y - other.y)) <= reach_m
+            and abs(wrap_angle(one.yaw - other.yaw)) <= reach_rad
+        )
+
     def is_inside(self, prior: PriorWindow | None) -> bool:
         """Whether the transform lies in a window, or there is none."""
         if prior is None:
@@ -68,6 +82,56 @@ class Answer:
             and abs(found.y - guess.y) <= 1.1 * prior.half_width_m
             and abs(wrap_angle(found.yaw - guess.yaw)) <= 1.1 * prior.half_width_rad
         )
+
+
+class AnswerBook:
+    """Answers by question.
+
+    A question near a guess needs not be asked where the same two maps were matched in another
+    window, if what was found there lies in this one too.
+
+    Parameters
+    ----------
+    answers
+        All that there are.
+    is_lenient
+        Take also maps of the same submaps with slightly different poses for the same: quicker,
+        but then it counts what was asked before.
+    """
+
+    def __init__(self, answers: Mapping[MatchKey, Answer], *, is_lenient: bool) -> None:
+        self._answers, self._is_lenient = answers, is_lenient
+        self._seen: dict[object, list[Answer]] = {}
+        if is_lenient:
+            for answer in answers.values():
+                self._note(answer)
+
+    def find(self, match: Match) -> Answer | None:
+        """The answer to exactly this question."""
+        answer = self._answers.get(match.key)
+        if answer is not None and not self._is_lenient:
+            self._note(answer)
+        return answer
+
+    def find_similar(self, match: Match) -> Answer | None:
+        """An answer that serves as well; of the questions that were found before, or of all."""
+        if match.prior is None:
+            return None
+        for earlier in self._seen.get(self._maps_of(match), ()):
+            if earlier.is_guess and earlier.is_inside(match.prior):
+                return earlier
+            if self._is_lenient and earlier.is_about(match.prior):
+                return earlier
+        return None
+
+    def _note(self, answer: Answer) -> None:
+        if answer.match.prior is not None:
+            self._seen.setdefault(self._maps_of(answer.match), []).append(answer)
+
+    def _maps_of(self, match: Match) -> object:
+        if self._is_lenient:
+            return match.source.ids, match.target.ids
+        return match.source.key, match.target.key
 
 
 _NUMBERS = (

@@ -49,6 +49,12 @@ class MapQueueConfig(Config):
     vague_share: float = setting(
         1.0, 0.0, 100.0, "at most so many such matches for each submap, on average"
     )
+    growth: float = setting(
+        1.5,
+        1.0,
+        100.0,
+        "while maps grow, refused ones are matched again when larger by this factor",
+    )
     inlier_probability: float = setting(
         0.99, 0.5, 0.999999, "share of right edges that the chi-square test of an edge keeps"
     )

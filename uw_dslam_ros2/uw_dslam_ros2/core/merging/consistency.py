@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.graph import (
     Edge,
+    chi2_threshold,
     compose_covariance,
     invert_covariance,
     mahalanobis,
@@ -96,7 +96,7 @@ def consistent_set(
     inlier_probability
         Share of true pairs that the chi-square test lets pass.
     """
-    threshold = float(chi2.ppf(inlier_probability, 3))
+    threshold = chi2_threshold(inlier_probability)
     graph = nx.Graph()
     # A clique finder takes exponential time in the worst case.
     order = sorted(range(len(edges)), key=lambda i: (-weights[i], i))[:_MAX_CLIQUE_EDGES]

@@ -6,6 +6,7 @@ adding a submap and taking it away again leaves the same bytes, and so does any 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import UNKNOWN, EvidenceGrid, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["Mosaic", "Patch", "Window", "fuse_maps", "render_patch", "snap_pose"]
@@ -97,6 +98,16 @@ def _render(
     num_rows, num_cols = values.shape
     for row in range(out.shape[0]):
         for col in range(out.shape[1]):
+            if num_samples == 1:  # the usual case, without the loops
+                y, x = row + 0.5, col + 0.5
+                source_row = math.floor(origin_row - step_sin * x + step_cos * y)
+                source_col = math.floor(origin_col + step_cos * x + step_sin * y)
+                out[row, col] = _NO_EVIDENCE
+                if 0 <= source_row < num_rows and 0 <= source_col < num_cols:
+                    value = values[source_row, source_col]
+                    if value >= 0:
+                        out[row, col] = table[value]
+                continue
             count = 0
             total = np.int64(0)
             strongest = np.int64(0)
@@ -240,9 +251,7 @@ class Mosaic:
 
     def spec_of(self, window: Window) -> GridSpec:
         """Place of a rectangle as a grid of its own."""
-        res = self._lattice.resolution_m
-        corner = self._lattice.T_frame_grid @ SE2(window.col_0 * res, window.row_0 * res)
-        return GridSpec(res, *window.shape, corner)
+        return _spec_of(self._lattice, window)
 
     def evidence(self) -> EvidenceGrid | None:
         """Everything; None without evidence."""
@@ -274,6 +283,34 @@ class Mosaic:
                     found.append((key, float(units) / _UNITS_PER_NAT))
         return found
 
+    def contributor_sets(self) -> tuple[NDArray[np.uint32], list[frozenset[Hashable]]]:
+        """For each cell of `evidence`, which patches saw it: an index into a list of sets.
+
+        The sets are numbered in the order of the patches' keys, so equal mosaics give equal
+        arrays; number 0 is the empty set.
+        """
+        window = self.window()
+        sets: list[frozenset[Hashable]] = [frozenset()]
+        if window is None:
+            return np.zeros((0, 0), dtype=np.uint32), sets
+        owners = np.zeros(window.shape, dtype=np.uint32)
+        for key in sorted(self._patches, key=repr):
+            patch = self._patches[key][1]
+            if patch.units.size == 0:
+                continue
+            part = owners[patch.window.slices(window)]
+            before, after = part[patch.observed], {}
+            for number in np.unique(before).tolist():
+                after[number] = len(sets)
+                sets.append(sets[number] | {key})
+            table = np.zeros(max(after, default=0) + 1, dtype=np.uint32)
+            table[list(after)] = list(after.values())
+            part[patch.observed] = table[before]
+        # Sets that a later patch has covered wholly are used by no cell any more.
+        used, packed = np.unique(np.append(owners, np.uint32(0)), return_inverse=True)
+        owners = packed[:-1].reshape(window.shape).astype(np.uint32)
+        return owners, [sets[number] for number in used.tolist()]
+
     def _add(self, patch: Patch, sign: int) -> None:
         if patch.units.size == 0:
             return
@@ -283,7 +320,6 @@ class Mosaic:
         self._sum[index] += np.int32(sign) * np.where(observed, patch.units, 0).astype(np.int32)
         is_occupied = observed & (patch.units > 0)
         step = np.uint16(1)
-        is_free = observed & ~is_occupied
         is_free = observed & ~is_occupied
         for votes, mask in ((self._num_occupied, is_occupied), (self._num_free, is_free)):
             if sign > 0:
@@ -320,8 +356,35 @@ def fuse_maps(
     lattice: GridSpec, maps: Iterable[tuple[OccupancyMap, SE2]], log_odds_max: float
 ) -> OccupancyMap | None:
     """One map of several placed ones (each with its ``T_frame_map``); None if nothing was seen."""
-    mosaic = Mosaic(lattice, log_odds_max)
-    for index, (occupancy, T_frame_map) in enumerate(maps):
-        mosaic.put(index, None, render_patch(lattice, occupancy, T_frame_map))
-    evidence = mosaic.evidence()
-    return None if evidence is None else evidence.to_occupancy()
+    patches = [render_patch(lattice, occupancy, T_frame_map) for occupancy, T_frame_map in maps]
+    patches = [patch for patch in patches if patch.units.size]
+    if not patches:
+        return None
+    window = functools.reduce(Window.union, (patch.window for patch in patches))
+    total = np.zeros(window.shape, dtype=np.int32)
+    is_seen = np.zeros(window.shape, dtype=np.bool_)
+    for patch in patches:
+        index, observed = patch.window.slices(window), patch.observed
+        np.add(total[index], patch.units, out=total[index], where=observed)
+        is_seen[index] |= observed
+    limit = math.ceil(log_odds_max * _UNITS_PER_NAT)
+    np.clip(total, -limit, limit, out=total)
+    values = _percent_table(limit, log_odds_max)[total + limit]
+    values[~is_seen] = UNKNOWN
+    return OccupancyMap(_spec_of(lattice, window), values)
+
+
+@functools.cache
+def _percent_table(limit: int, log_odds_max: float) -> NDArray[np.int8]:
+    """Percent of each whole number of units from ``-limit`` on, as `EvidenceGrid` rounds."""
+    units = np.arange(-limit, limit + 1)[None]
+    log_odds = np.clip((units / np.float64(_UNITS_PER_NAT)), -log_odds_max, log_odds_max)
+    seen = np.ones(units.shape, dtype=np.bool_)
+    evidence = EvidenceGrid(GridSpec(1.0, *units.shape), log_odds.astype(np.float32), seen)
+    return evidence.to_occupancy().values[0]
+
+
+def _spec_of(lattice: GridSpec, window: Window) -> GridSpec:
+    res = lattice.resolution_m
+    corner = lattice.T_frame_grid @ SE2(window.col_0 * res, window.row_0 * res)
+    return GridSpec(res, *window.shape, corner)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
@@ -17,6 +17,7 @@ from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 __all__ = [
     "Edge",
     "Solution",
+    "chi2_threshold",
     "compose_covariance",
     "invert_covariance",
     "mahalanobis",
@@ -52,6 +53,11 @@ class Solution:
 
     T_anchor_submap: dict[SubmapId, SE2]
     is_inlier: NDArray[np.bool_]
+
+
+def chi2_threshold(probability: float) -> float:
+    """Squared Mahalanobis distance that a share of true motions stays below."""
+    return float(chdtri(3, 1.0 - probability))  # scipy.stats has it too, but loads slowly
 
 
 def compose_covariance(covariance: FloatArray, left: SE2, middle: SE2, right: SE2) -> FloatArray:
@@ -113,7 +119,7 @@ def solve_graph(
         graph.add(_factor(keys, edge))
     for submap_id, motion in initial.items():
         values.insert(keys[submap_id], gtsam.Pose2(motion.x, motion.y, motion.yaw))
-    threshold = float(chi2.ppf(inlier_probability, 3))
+    threshold = chi2_threshold(inlier_probability)
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     errors = _loose_errors(graph, result, len(loose))
     if (errors > threshold).any():

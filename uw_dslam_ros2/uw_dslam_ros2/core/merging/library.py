@@ -83,13 +83,27 @@ class Library:
         """Each vehicle's map up to its last milestone, of closed submaps where there are any."""
         units = {}
         for vehicle in self._by_vehicle:
-            ids = self._closed(vehicle)
+            ids = self.closed(vehicle)
             units[vehicle] = self._odometry_unit(ids[: milestone(len(ids))])
         return units
 
+    @property
+    def vehicles(self) -> list[str]:
+        """Those that have something to match, sorted."""
+        return sorted(self._by_vehicle)
+
+    def closed(self, vehicle: str) -> list[SubmapId]:
+        """A vehicle's closed submaps; all of them where none is closed yet."""
+        ids = self._by_vehicle[vehicle]
+        return [i for i in ids if self.active[i].submap.is_final] or ids
+
+    def closed_unit(self, vehicle: str) -> Unit:
+        """All of a vehicle's closed submaps."""
+        return self._odometry_unit(self.closed(vehicle))
+
     def window(self, submap_id: SubmapId) -> Unit:
         """A submap with its neighbours in its vehicle's sequence."""
-        ids = self._closed(submap_id[0])
+        ids = self.closed(submap_id[0])
         index = ids.index(submap_id)
         reach = self._num_neighbours if len(ids) > 2 * self._num_neighbours + 1 else 0
         low, high = max(0, index - reach), index + reach + 1
@@ -99,7 +113,7 @@ class Library:
         """Stretches of each vehicle in a side, overlapping by half; never all of a vehicle."""
         units: list[Unit] = []
         for vehicle in sorted({submap_id[0] for submap_id in side.T_frame_submap}):
-            ids = self._closed(vehicle)
+            ids = self.closed(vehicle)
             length = min(self._part_length, -(-len(ids) // 2))
             stride = max(1, length // 2)
             last = len(ids) - length
@@ -116,15 +130,19 @@ class Library:
 
     def vehicle_side(self, vehicle: str) -> Side:
         """A vehicle's closed submaps, placed by its own odometry."""
-        poses = {i: self.odometry.T_odom_submap(i) for i in self._closed(vehicle)}
+        return self.side_of(self.closed(vehicle))
+
+    def side_of(self, ids: Sequence[SubmapId]) -> Side:
+        """Submaps of one vehicle, placed by its own odometry."""
+        poses = {i: self.odometry.T_odom_submap(i) for i in ids}
         return Side(poses, self.odometry.covariance)
 
     def component_side(self, component: Component, vehicle: str | None = None) -> Side:
         """The closed submaps of a component, or of one vehicle in it, placed by the graph."""
         vehicles = sorted({i[0] for i in component}) if vehicle is None else [vehicle]
-        ids = [i for v in vehicles if v in self._by_vehicle for i in self._closed(v)]
+        ids = [i for v in vehicles if v in self._by_vehicle for i in self.closed(v)]
         poses = {i: component[i] for i in ids if i in component}
-        first = {v: self._closed(v)[0] for v in vehicles if v in self._by_vehicle}
+        first = {v: self.closed(v)[0] for v in vehicles if v in self._by_vehicle}
 
         def covariance(target: SubmapId, source: SubmapId) -> FloatArray:
             if target[0] == source[0]:
@@ -150,6 +168,12 @@ class Library:
         """Descriptor of the unit's map."""
         return self._remember(("shape", unit.key), lambda: shape_of(self.render(unit)))
 
+    def rough_shape(self, vehicle: str) -> MapShape:
+        """Descriptor of a vehicle's map, as it was at its last milestone."""
+        ids = self.closed(vehicle)[: milestone(len(self.closed(vehicle)))]
+        key = ("rough", tuple((i, self.active[i].digest) for i in ids))
+        return self._remember(key, lambda: shape_of(self.render(self._odometry_unit(ids))))
+
     def shared_area_m2(self, source: SubmapId, target: SubmapId, T_target_source: SE2) -> float:
         """Area that two submaps have both seen."""
         first, second = self.submaps[source], self.submaps[target]
@@ -167,11 +191,6 @@ class Library:
         return self._remember(
             key, lambda: settle(self.submaps, anchor, edges, joints, inlier_probability)
         )
-
-    def _closed(self, vehicle: str) -> list[SubmapId]:
-        """A vehicle's closed submaps; all of them where none is closed yet."""
-        ids = self._by_vehicle[vehicle]
-        return [i for i in ids if self.active[i].submap.is_final] or ids
 
     def _odometry_unit(self, ids: Sequence[SubmapId], reference: SubmapId | None = None) -> Unit:
         members = [self.active[i] for i in ids]

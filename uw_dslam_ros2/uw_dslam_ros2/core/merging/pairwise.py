@@ -10,9 +10,11 @@ from collections.abc import Mapping, Sequence
 from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan
 from uw_dslam_ros2.core.merging.settling import Component, Joint
+from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -25,6 +27,8 @@ def make_pairwise_plan(
     answers: Mapping[MatchKey, Answer],
     anchor: SubmapId,
     config: MapQueueConfig,
+    *,
+    is_growing: bool = False,
 ) -> Plan:
     """Merge the vehicles' maps in the order given, and say which question is open.
 
@@ -43,6 +47,9 @@ def make_pairwise_plan(
         The submap that the global frame is pinned to.
     config
         Settings.
+    is_growing
+        More submaps are expected: match each vehicle's first 1, 2, 4, 8, ... submaps, so that not
+        each new one asks everything anew.
     """
     verifier = Verifier(library, answers, config)
     queue = [_vehicle_map(library, vehicle) for vehicle in vehicles]
@@ -53,7 +60,8 @@ def make_pairwise_plan(
     num_refused = 0
     while len(queue) > 1 and num_refused < len(queue):
         first, rest = queue[0], queue[1:]
-        merged = _merge_first(library, verifier, first, rest, joints, refused)
+        units = [_unit(library, component, is_growing) for component in (first, *rest)]
+        merged = _merge_first(verifier, first, rest, units, joints, refused)
         if verifier.wanted:
             break
         if merged is None:
@@ -73,18 +81,29 @@ def _vehicle_map(library: Library, vehicle: str) -> Component:
     return {i: T_first_odom @ library.odometry.T_odom_submap(i) for i in ids}
 
 
+def _unit(library: Library, component: Component, is_growing: bool) -> Unit:
+    """What is matched of a map: all, or the first 1, 2, 4, 8, ... submaps of each vehicle."""
+    side = library.component_side(component)
+    if is_growing:
+        members: dict[str, list[SubmapId]] = {}
+        for submap_id in sorted(side.T_frame_submap):
+            members.setdefault(submap_id[0], []).append(submap_id)
+        begun = [i for ids in members.values() for i in ids[: 1 << (len(ids).bit_length() - 1)]]
+        side = Side({i: side.T_frame_submap[i] for i in begun}, side.covariance)
+    return library.component_unit(side)
+
+
 def _merge_first(
-    library: Library,
     verifier: Verifier,
     first: Component,
     rest: Sequence[Component],
+    units: Sequence[Unit],
     joints: list[Joint],
     refused: set[frozenset[bytes]],
 ) -> tuple[int, Component] | None:
     """Index of the map that the first one was merged with, and the merged map."""
-    target = library.component_unit(library.component_side(first))
-    for index, other in enumerate(rest):
-        source = library.component_unit(library.component_side(other))
+    target = units[0]
+    for index, (other, source) in enumerate(zip(rest, units[1:], strict=True)):
         pair = frozenset((source.key, target.key))
         if pair in refused:
             continue  # asked the other way round

@@ -36,7 +36,7 @@ from uw_dslam_ros2.core.merging.settling import Component, Joint
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.merging.verification import Verifier
 
-__all__ = ["Plan", "make_plan"]
+__all__ = ["Plan", "component_numbers", "make_plan"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +145,7 @@ class _Planner:
     ) -> list[tuple[str, str]]:
         """Pairs whose vehicles are in different components."""
         _, components = self._settle(joints)
-        where = _component_of(components)
+        where = component_numbers(components)
         return [(a, b) for a, b in pairs if where[self._unit_id(a)] != where[self._unit_id(b)]]
 
     def _unit_id(self, vehicle: str) -> SubmapId:
@@ -154,7 +154,7 @@ class _Planner:
     def _match_meeting(self, joints: Sequence[Joint]) -> list[Joint]:
         """Step 3: a prior from the graph for vehicles without a match of their own."""
         settled, components = self._settle(joints)
-        where = _component_of(components)
+        where = component_numbers(components)
         matched = {frozenset((j.edge.source[0], j.edge.target[0])) for j in settled if j.is_inlier}
         found: list[Joint] = []
         for target, source in itertools.combinations(sorted(self._units), 2):
@@ -197,7 +197,10 @@ class _Planner:
         found: list[Joint] = []
         for component in components:
             side = self._library.component_side(component)
-            found += self._verifier.joints_where_vague(side, inliers)
+            limit = round(self._config.vague_share * len(side.T_frame_submap))
+            found += self._verifier.joints_where_vague(
+                side, inliers, self._config.vague_cells, limit
+            )
         return found
 
     def _between(
@@ -227,7 +230,7 @@ class _Planner:
     def _carried(self, settled: Sequence[Joint], components: Sequence[Component]) -> list[Joint]:
         """Standing answers that this plan has not asked for, where it has nothing of its own."""
         own = {frozenset((j.edge.source[0], j.edge.target[0])) for j in settled if j.is_inlier}
-        where = _component_of(components)
+        where = component_numbers(components)
         carried: list[Joint] = []
         for key in sorted(self._standing - self._verifier.visited):
             answer = self._answers.get(key)
@@ -255,7 +258,8 @@ class _Planner:
         return self._library.settle(self._anchor, unique, self._config.inlier_probability)
 
 
-def _component_of(components: Sequence[Component]) -> dict[SubmapId, int]:
+def component_numbers(components: Sequence[Component]) -> dict[SubmapId, int]:
+    """Index of the component of each submap."""
     return {
         submap_id: index for index, component in enumerate(components) for submap_id in component
     }

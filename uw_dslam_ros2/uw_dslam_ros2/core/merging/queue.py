@@ -13,19 +13,20 @@ from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
 from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, numbers_of
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
-from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
-from uw_dslam_ros2.core.merging.graph import residual
+from uw_dslam_ros2.core.merging.fusion import Window
+from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
+from uw_dslam_ros2.core.merging.growing import make_growing_plan
 from uw_dslam_ros2.core.merging.library import Library, Memory
 from uw_dslam_ros2.core.merging.pairwise import make_pairwise_plan
 from uw_dslam_ros2.core.merging.plan import Plan, make_plan
+from uw_dslam_ros2.core.merging.records import constraints_of, records_of
 from uw_dslam_ros2.core.merging.settling import LoopError, loop_errors
 from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
-    ConstraintKind,
+    MapProvenance,
     MatchRequest,
     SubmapRecord,
-    SubmapState,
 )
 from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.registration.result import RegistrationResult
@@ -57,7 +58,8 @@ class MapQueue:
         self._next_request_id = 1
         self._plan_cache: Plan | None = None
         self._lattice: GridSpec | None = None
-        self._mosaic: Mosaic | None = None
+        self._global_map: GlobalMap | None = None
+        self._is_growing = False
         self._is_drawn = False
 
     def add_submap(self, submap: Submap) -> None:
@@ -85,7 +87,8 @@ class MapQueue:
         wanted = self._config.anchor_vehicle
         if self._anchor is None and wanted in ("", submap.vehicle_id):
             self._anchor = submap.submap_id
-            self._lattice = self._lattice_of(submap.grid.spec)
+            resolution_m = self._config.resolution_m or submap.grid.spec.resolution_m
+            self._lattice = pinned_lattice(submap.grid.spec, resolution_m)
         self._change()
 
     def next_requests(self, max_requests: int) -> list[MatchRequest]:
@@ -125,6 +128,21 @@ class MapQueue:
         self._in_flight.pop(request_id, None)
 
     @property
+    def is_growing(self) -> bool:
+        """Whether more submaps are expected soon; False at first.
+
+        True: only what may change something now is asked, see `growing`. False: all that is left
+        is asked, and what comes out depends on the submaps alone and not on their order.
+        """
+        return self._is_growing
+
+    @is_growing.setter
+    def is_growing(self, value: bool) -> None:
+        if value != self._is_growing:
+            self._is_growing = value
+            self._change()
+
+    @property
     def num_in_flight(self) -> int:
         """Requests asked and not answered yet."""
         return len(self._in_flight)
@@ -157,16 +175,8 @@ class MapQueue:
 
     def submaps(self) -> list[SubmapRecord]:
         """All submaps, by vehicle and sequence."""
-        plan = self._plan()
-        place: dict[SubmapId, tuple[int, SE2]] = {}
-        first = 0 if self._anchor is not None else 1
-        for index, component in enumerate(plan.components, start=first):
-            place |= {submap_id: (index, motion) for submap_id, motion in component.items()}
-        tries = self._num_tries()
-        return [
-            self._record(submap_id, *place[submap_id], tries.get(submap_id[0], 0))
-            for submap_id in sorted(self._submaps)
-        ]
+        answers = list(self._answers.values())
+        return records_of(self._submaps, self._withdrawn, self._plan(), self._anchor, answers)
 
     def answers(self) -> list[tuple[Answer, bool]]:
         """All answers, by target and source, and whether each holds in the pose graph."""
@@ -179,26 +189,7 @@ class MapQueue:
 
     def constraints(self) -> list[Constraint]:
         """All edges of the pose graph with what is left of them after optimisation."""
-        plan = self._plan()
-        where = {i: n for n, component in enumerate(plan.components) for i in component}
-        found: list[Constraint] = []
-        edges = [(ConstraintKind.ODOMETRY, edge, True) for edge in plan.odometry]
-        edges += [(ConstraintKind.REGISTRATION, j.edge, j.is_inlier) for j in plan.joints]
-        for kind, edge, is_inlier in edges:
-            is_joined = where[edge.source] == where[edge.target]
-            poses = plan.components[where[edge.source]] if is_joined else {}
-            found.append(
-                Constraint(
-                    kind,
-                    edge.source,
-                    edge.target,
-                    edge.T_target_source,
-                    edge.covariance,
-                    *residual(edge, poses),
-                    is_inlier,
-                )
-            )
-        return found
+        return constraints_of(self._plan())
 
     def loops(self) -> list[LoopError]:
         """Cycles of three and more submaps in the graph, and by how much each fails to close."""
@@ -207,19 +198,21 @@ class MapQueue:
 
     def global_map(self) -> EvidenceGrid | None:
         """The fused map in frame "map"; None before there is any evidence."""
-        mosaic = self._drawn()
-        return None if mosaic is None else mosaic.evidence()
+        drawn = self._drawn()
+        return None if drawn is None else drawn.evidence()
+
+    def provenance(self) -> MapProvenance | None:
+        """Who saw what in the global map, and where they disagree; None without evidence."""
+        drawn = self._drawn()
+        return None if drawn is None else drawn.provenance()
 
     def changed_window(self) -> tuple[GridSpec, Window] | None:
         """What changed in the global map since the last call, or None.
 
         The rectangle's place as a grid, and the rectangle in cells of the pinned lattice.
         """
-        mosaic = self._drawn()
-        window = None if mosaic is None else mosaic.take_changed()
-        if mosaic is None or window is None:
-            return None
-        return mosaic.spec_of(window), window
+        drawn = self._drawn()
+        return None if drawn is None else drawn.take_changed()
 
     def T_map_odom(self, vehicle_id: str) -> SE2 | None:  # noqa: N802 (notation of motions)
         """Place of a vehicle's odom frame, from its newest submap; None unless it is merged."""
@@ -294,10 +287,17 @@ class MapQueue:
             anchor = self._anchor or min(self._submaps)
             library = self._current_library()
             if self._config.mode == "pairwise":
-                vehicles = self._vehicles
-                plan = make_pairwise_plan(library, vehicles, self._answers, anchor, self._config)
+                plan = make_pairwise_plan(
+                    library,
+                    self._vehicles,
+                    self._answers,
+                    anchor,
+                    self._config,
+                    is_growing=self._is_growing,
+                )
             else:
-                plan = make_plan(library, self._answers, self._standing, anchor, self._config)
+                make = make_growing_plan if self._is_growing else make_plan
+                plan = make(library, self._answers, self._standing, anchor, self._config)
             self._standing = frozenset(joint.key for joint in plan.joints if joint.is_inlier)
             self._plan_cache = plan
         return self._plan_cache
@@ -319,81 +319,17 @@ class MapQueue:
             match.target.reference,
         )
 
-    def _record(
-        self, submap_id: SubmapId, component: int, T_component_submap: SE2, num_tries: int
-    ) -> SubmapRecord:
-        submap = self._submaps[submap_id].submap
-        if submap_id in self._withdrawn:
-            state, reason = SubmapState.WITHDRAWN, "taken out by a person"
-        elif component == 0:
-            state, reason = SubmapState.MERGED, self._merge_reason(submap_id)
-        else:
-            state, reason = SubmapState.WAITING, self._wait_reason(submap_id[0])
-        return SubmapRecord(submap, state, component, T_component_submap, num_tries, reason)
-
-    def _merge_reason(self, submap_id: SubmapId) -> str:
-        assert self._anchor is not None
-        if submap_id == self._anchor:
-            return "pins the global frame"
-        if submap_id[0] == self._anchor[0]:
-            return "odometry from the submap that pins the global frame"
-        partners = sorted(
-            {
-                j.edge.target[0] if j.edge.source[0] == submap_id[0] else j.edge.source[0]
-                for j in self._plan().joints
-                if j.is_inlier and submap_id[0] in (j.edge.source[0], j.edge.target[0])
-            }
-        )
-        return f"registered with {', '.join(partners)}"
-
-    def _wait_reason(self, vehicle: str) -> str:
-        reasons = [
-            answer.reason
-            for answer in self._answers.values()
-            if not answer.is_accepted
-            and vehicle in (answer.match.source.reference[0], answer.match.target.reference[0])
-        ]
-        return reasons[-1] if reasons else "not matched yet"
-
-    def _num_tries(self) -> dict[str, int]:
-        tries: dict[str, int] = {}
-        for answer in self._answers.values():
-            for unit in (answer.match.source, answer.match.target):
-                for vehicle in {submap_id[0] for submap_id in unit.ids}:
-                    tries[vehicle] = tries.get(vehicle, 0) + 1
-        return tries
-
-    def _drawn(self) -> Mosaic | None:
-        """The mosaic, up to date: draws only what is new or has moved."""
+    def _drawn(self) -> GlobalMap | None:
+        """The global map, up to date: draws only what is new or has moved."""
         if self._lattice is None:
             return None
-        if self._mosaic is None:
-            self._mosaic = Mosaic(self._lattice, self._config.log_odds_max)
-        mosaic = self._mosaic
+        if self._global_map is None:
+            self._global_map = GlobalMap(self._lattice, self._config.log_odds_max)
         if not self._is_drawn:
             shown = {i: T for i, T in self._merged().items() if i not in self._withdrawn}
-            for key in [key for key in mosaic.keys() if key not in shown]:  # noqa: SIM118
-                mosaic.remove(key)
-            for submap_id, motion in shown.items():
-                stored = self._submaps[submap_id]
-                snapped = snap_pose(motion, mosaic.lattice.resolution_m, stored.radius_m)
-                version = (stored.digest, snapped)
-                if mosaic.version_of(submap_id) != version:
-                    patch = render_patch(mosaic.lattice, stored.submap.grid, snapped)
-                    mosaic.put(submap_id, version, patch)
+            self._global_map.draw(self._submaps, shown)
             self._is_drawn = True
-        return mosaic
-
-    def _lattice_of(self, spec: GridSpec) -> GridSpec:
-        """Cells of the pinning submap, reduced to the cell at its frame's origin.
-
-        A later revision that has grown by whole cells means the same lattice.
-        """
-        resolution_m = self._config.resolution_m or spec.resolution_m
-        turn = SE2(0.0, 0.0, spec.T_frame_grid.yaw)
-        corner = turn.inverse().apply(spec.T_frame_grid.as_array()[:2]) / resolution_m
-        phase = np.round(corner - np.floor(corner + 1e-6), 9) * resolution_m
-        return GridSpec(resolution_m, 1, 1, turn @ SE2(float(phase[0]), float(phase[1])))
+        return self._global_map
 
 
 def _moved(motion: SE2, poses: NDArray[np.float64]) -> NDArray[np.float64]:

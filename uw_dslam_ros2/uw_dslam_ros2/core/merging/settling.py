@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import networkx as nx
 
@@ -27,6 +27,8 @@ class Joint:
     edge: Edge
     probability: float
     is_inlier: bool = True
+    is_unsure: bool = False
+    """Refused by itself; believed because others agree with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,7 @@ def settle(
                     num_dropped += 1
             components.append(solution.T_anchor_submap)
         if num_dropped == 0:
-            settled = [Joint(j.key, j.edge, j.probability, is_inlier[j.key]) for j in ordered]
+            settled = [replace(joint, is_inlier=is_inlier[joint.key]) for joint in ordered]
             return settled, components
 
 

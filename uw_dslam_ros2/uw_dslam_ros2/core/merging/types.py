@@ -8,12 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["Constraint", "ConstraintKind", "MatchRequest", "SubmapRecord", "SubmapState"]
+__all__ = [
+    "Constraint",
+    "ConstraintKind",
+    "MapProvenance",
+    "MatchRequest",
+    "SubmapRecord",
+    "SubmapState",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -79,3 +86,32 @@ class Constraint:
     residual_m: float
     residual_rad: float
     is_inlier: bool
+    is_unsure: bool = False
+    """A registration that was refused by itself; believed because others agree with it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapProvenance:
+    """Which submaps each cell of the global map comes from, and where they disagree.
+
+    Parameters
+    ----------
+    spec
+        Place of the arrays in frame "map"; that of the global map.
+    contradictions
+        (R, C) uint16: how many submaps say the opposite of the cell's majority (free, occupied).
+    owners
+        (R, C) uint32: index of the cell's set of submaps in `contributors`; 0, the empty set,
+        where nothing was seen.
+    contributors
+        Sets of submaps, each sorted.
+    """
+
+    spec: GridSpec
+    contradictions: NDArray[np.uint16]
+    owners: NDArray[np.uint32]
+    contributors: tuple[tuple[SubmapId, ...], ...]
+
+    def of_cell(self, row: int, col: int) -> tuple[SubmapId, ...]:
+        """Submaps that saw a cell."""
+        return self.contributors[int(self.owners[row, col])]

@@ -1,0 +1,76 @@
+"""The global map of a queue: drawn on one pinned lattice, and only where something moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
+from uw_dslam_ros2.core.mapping.submap import SubmapId
+from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
+from uw_dslam_ros2.core.merging.types import MapProvenance
+from uw_dslam_ros2.core.merging.units import StoredSubmap
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["GlobalMap", "pinned_lattice"]
+
+
+class GlobalMap:
+    """A mosaic of submaps in frame "map"."""
+
+    def __init__(self, lattice: GridSpec, log_odds_max: float) -> None:
+        self._mosaic = Mosaic(lattice, log_odds_max)
+
+    def draw(
+        self, submaps: Mapping[SubmapId, StoredSubmap], T_map_submap: Mapping[SubmapId, SE2]
+    ) -> None:
+        """Make it show exactly these submaps; what lies as before is left alone."""
+        mosaic = self._mosaic
+        for key in [key for key in mosaic.keys() if key not in T_map_submap]:  # noqa: SIM118
+            mosaic.remove(key)
+        for submap_id, motion in T_map_submap.items():
+            stored = submaps[submap_id]
+            snapped = snap_pose(motion, mosaic.lattice.resolution_m, stored.radius_m)
+            version = (stored.digest, snapped)
+            if mosaic.version_of(submap_id) != version:
+                patch = render_patch(mosaic.lattice, stored.submap.grid, snapped)
+                mosaic.put(submap_id, version, patch)
+
+    def evidence(self) -> EvidenceGrid | None:
+        """The fused map; None without evidence."""
+        return self._mosaic.evidence()
+
+    def take_changed(self) -> tuple[GridSpec, Window] | None:
+        """What changed since the last call: its place as a grid, and in cells of the lattice."""
+        window = self._mosaic.take_changed()
+        return None if window is None else (self._mosaic.spec_of(window), window)
+
+    def provenance(self) -> MapProvenance | None:
+        """Who saw what; None without evidence."""
+        window = self._mosaic.window()
+        contradictions = self._mosaic.contradictions()
+        if window is None or contradictions is None:
+            return None
+        owners, sets = self._mosaic.contributor_sets()
+        named = tuple(tuple((str(i[0]), int(i[1])) for i in sorted(keys)) for keys in sets)  # type: ignore[index,type-var]
+        return MapProvenance(self._mosaic.spec_of(window), contradictions, owners, named)
+
+
+def pinned_lattice(spec: GridSpec, resolution_m: float) -> GridSpec:
+    """Cells of the pinning submap, reduced to the cell at its frame's origin.
+
+    A later revision that has grown by whole cells means the same lattice.
+
+    Parameters
+    ----------
+    spec
+        The pinning submap's grid.
+    resolution_m
+        Of the lattice.
+    """
+    turn = SE2(0.0, 0.0, spec.T_frame_grid.yaw)
+    corner = turn.inverse().apply(spec.T_frame_grid.as_array()[:2]) / resolution_m
+    phase: NDArray[np.float64] = np.round(corner - np.floor(corner + 1e-6), 9) * resolution_m
+    return GridSpec(resolution_m, 1, 1, turn @ SE2(float(phase[0]), float(phase[1])))

@@ -1,0 +1,160 @@
+"""What is to be asked while the maps still grow: only what can change something now.
+
+The plan of `plan` is worked out for maps that are there as a whole; asked again with every submap
+it would ask nearly all of its questions each time. While more is expected, this plan is used:
+
+1. What holds goes on to hold.
+2. Vehicles that are still apart are matched as wholes, the most promising pair first and one
+   question for each vehicle at a time; a pair that was refused only when the two maps have grown
+   so much together that another answer can be hoped for.
+3. What was accepted is checked as in `plan`; checks of the same submaps count, although their
+   poses have moved a little since.
+4. A new submap of a vehicle that is joined is matched once, where it has seen most of what was
+   seen before, if the graph is vague there.
+
+When the vehicles have come to rest, `plan` asks what is left to ask, and decides: so the map in
+the end does not depend on what was asked in between.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+
+from uw_dslam_ros2.core.mapping.submap import SubmapId
+from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
+from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.descriptors import promise
+from uw_dslam_ros2.core.merging.library import Library
+from uw_dslam_ros2.core.merging.plan import Plan, component_numbers
+from uw_dslam_ros2.core.merging.settling import Component, Joint
+from uw_dslam_ros2.core.merging.verification import Verifier, is_worth_checking
+
+__all__ = ["make_growing_plan"]
+
+Pair = tuple[str, str]
+
+
+def make_growing_plan(
+    library: Library,
+    answers: Mapping[MatchKey, Answer],
+    standing: AbstractSet[MatchKey],
+    anchor: SubmapId,
+    config: MapQueueConfig,
+) -> Plan:
+    """Work out the plan; parameters as of `make_plan`."""
+    return _GrowingPlanner(library, answers, standing, anchor, config).run()
+
+
+class _GrowingPlanner:
+    """One working-out of the plan; the steps of the module's description in `run`."""
+
+    def __init__(
+        self,
+        library: Library,
+        answers: Mapping[MatchKey, Answer],
+        standing: AbstractSet[MatchKey],
+        anchor: SubmapId,
+        config: MapQueueConfig,
+    ) -> None:
+        self._library, self._anchor, self._config = library, anchor, config
+        self._verifier = Verifier(library, answers, config, is_lenient=True)
+        self._standing = [
+            answers[key]
+            for key in sorted(standing)
+            if key in answers and library.holds(answers[key].match)
+        ]
+        self._claims = _claims(library, answers.values())
+
+    def run(self) -> Plan:
+        joints = [self._verifier.joint(answer) for answer in self._standing]
+        settled, components = self._settle(joints)
+        for pair in self._apart(components):
+            joints += self._check_claims(pair)
+        settled, components = self._settle(joints)
+        if not self._verifier.wanted:
+            self._ask_best(self._apart(components))
+        for component in components:
+            joints += self._tie_newest(component, settled)
+        settled, components = self._settle(joints)
+        wanted = list(self._verifier.wanted.values())
+        return Plan(wanted, settled, self._library.odometry.edges, components)
+
+    def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
+        unique = list({joint.key: joint for joint in joints}.values())
+        return self._library.settle(self._anchor, unique, self._config.inlier_probability)
+
+    def _apart(self, components: Sequence[Component]) -> list[Pair]:
+        """Pairs of vehicles of different components, the most promising first."""
+        where = component_numbers(components)
+        number = {v: where[self._library.closed(v)[0]] for v in self._library.vehicles}
+        pairs = [
+            pair
+            for pair in itertools.combinations(self._library.vehicles, 2)
+            if number[pair[0]] != number[pair[1]]
+        ]
+        if len(pairs) < 2:
+            return pairs
+        shapes = {v: self._library.rough_shape(v) for pair in pairs for v in pair}
+        return sorted(pairs, key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
+
+    def _check_claims(self, pair: Pair) -> list[Joint]:
+        """Joints of earlier answers that may be right, the one of the largest maps first."""
+        for answer in self._claims.get(pair, ()):
+            if not is_worth_checking(answer):
+                continue
+            sides = [
+                self._library.side_of(unit.ids)
+                for unit in (answer.match.source, answer.match.target)
+            ]
+            joints = self._verifier.joints_of(answer.match, sides[0], sides[1])
+            if joints or self._verifier.wanted:
+                return joints
+        return []
+
+    def _ask_best(self, pairs: Iterable[Pair]) -> None:
+        busy: set[str] = set()
+        for target, source in pairs:
+            if busy.isdisjoint((target, source)) and self._has_grown((target, source)):
+                units = self._library.closed_unit(source), self._library.closed_unit(target)
+                self._verifier.ask(Match(*units))
+                busy |= {target, source}
+
+    def _has_grown(self, pair: Pair) -> bool:
+        """Whether both maps together have grown enough since the last answer."""
+        now = len(self._library.closed(pair[0])) * len(self._library.closed(pair[1]))
+        asked = max((_size(answer) for answer in self._claims.get(pair, ())), default=0)
+        return now >= self._config.growth**2 * asked and now > asked
+
+    def _tie_newest(self, component: Component, joints: Sequence[Joint]) -> list[Joint]:
+        """Step 4: the newest place of each vehicle whose neighbours are there."""
+        side = self._library.component_side(component)
+        reach = self._config.num_neighbours
+        newest = set()
+        for vehicle in {submap_id[0] for submap_id in side.T_frame_submap}:
+            ids = self._library.closed(vehicle)
+            newest.add(ids[max(0, len(ids) - 1 - reach)])
+        inliers = [joint for joint in joints if joint.is_inlier]
+        vague_cells = self._config.growth * self._config.vague_cells
+        return self._verifier.joints_where_vague(side, inliers, vague_cells, 1, newest)
+
+
+def _claims(library: Library, answers: Iterable[Answer]) -> dict[Pair, list[Answer]]:
+    """Answers to questions without a guess, of one vehicle's map in another's; largest first."""
+    found: dict[Pair, list[Answer]] = {}
+    for answer in answers:
+        match = answer.match
+        source = {submap_id[0] for submap_id in match.source.ids}
+        target = {submap_id[0] for submap_id in match.target.ids}
+        is_pair = match.prior is None and len(source) == len(target) == 1 and source != target
+        if is_pair and library.holds(match):
+            first, second = sorted(source | target)
+            found.setdefault((first, second), []).append(answer)
+    for claims in found.values():
+        claims.sort(key=lambda answer: (-_size(answer), answer.match.key))
+    return found
+
+
+def _size(answer: Answer) -> int:
+    return len(answer.match.source.ids) * len(answer.match.target.ids)

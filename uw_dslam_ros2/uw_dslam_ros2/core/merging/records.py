@@ -1,0 +1,117 @@
+"""What the queue says of each submap: where it is, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
+
+from uw_dslam_ros2.core.mapping.submap import SubmapId
+from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.graph import residual
+from uw_dslam_ros2.core.merging.plan import Plan, component_numbers
+from uw_dslam_ros2.core.merging.types import (
+    Constraint,
+    ConstraintKind,
+    SubmapRecord,
+    SubmapState,
+)
+from uw_dslam_ros2.core.merging.units import StoredSubmap
+
+__all__ = ["constraints_of", "records_of"]
+
+
+def records_of(
+    submaps: Mapping[SubmapId, StoredSubmap],
+    withdrawn: AbstractSet[SubmapId],
+    plan: Plan,
+    anchor: SubmapId | None,
+    answers: Sequence[Answer],
+) -> list[SubmapRecord]:
+    """All submaps, by vehicle and sequence."""
+    first = 0 if anchor is not None else 1
+    number = component_numbers(plan.components)
+    tries = _num_tries(answers)
+    records = []
+    for submap_id in sorted(submaps):
+        component = first + number[submap_id]
+        if submap_id in withdrawn:
+            state, reason = SubmapState.WITHDRAWN, "taken out by a person"
+        elif component == 0:
+            state, reason = SubmapState.MERGED, _merge_reason(submap_id, anchor, plan)
+        else:
+            state, reason = SubmapState.WAITING, _wait_reason(submap_id[0], answers)
+        records.append(
+            SubmapRecord(
+                submaps[submap_id].submap,
+                state,
+                component,
+                plan.components[number[submap_id]][submap_id],
+                tries.get(submap_id[0], 0),
+                reason,
+            )
+        )
+    return records
+
+
+def constraints_of(plan: Plan) -> list[Constraint]:
+    """All edges of the pose graph with what is left of them after optimisation."""
+    where = component_numbers(plan.components)
+    found: list[Constraint] = []
+    edges = [(ConstraintKind.ODOMETRY, edge, True, False) for edge in plan.odometry]
+    edges += [
+        (ConstraintKind.REGISTRATION, joint.edge, joint.is_inlier, joint.is_unsure)
+        for joint in plan.joints
+    ]
+    for kind, edge, is_inlier, is_unsure in edges:
+        is_joined = where[edge.source] == where[edge.target]
+        poses = plan.components[where[edge.source]] if is_joined else {}
+        found.append(
+            Constraint(
+                kind,
+                edge.source,
+                edge.target,
+                edge.T_target_source,
+                edge.covariance,
+                *residual(edge, poses),
+                is_inlier,
+                is_unsure,
+            )
+        )
+    return found
+
+
+def _merge_reason(submap_id: SubmapId, anchor: SubmapId | None, plan: Plan) -> str:
+    assert anchor is not None
+    if submap_id == anchor:
+        return "pins the global frame"
+    if submap_id[0] == anchor[0]:
+        return "odometry from the submap that pins the global frame"
+    own = [
+        joint
+        for joint in plan.joints
+        if joint.is_inlier and submap_id[0] in (joint.edge.source[0], joint.edge.target[0])
+    ]
+    partners = {i[0] for joint in own for i in (joint.edge.source, joint.edge.target)}
+    reason = f"registered with {', '.join(sorted(partners - {submap_id[0]}))}"
+    if own and all(joint.is_unsure for joint in own):
+        reason += ", by several answers that are unsure alone and agree"
+    return reason
+
+
+def _wait_reason(vehicle: str, answers: Sequence[Answer]) -> str:
+    reasons = [
+        answer.reason
+        for answer in answers
+        if not answer.is_accepted
+        and vehicle in (answer.match.source.reference[0], answer.match.target.reference[0])
+    ]
+    return reasons[-1] if reasons else "not matched yet"
+
+
+def _num_tries(answers: Sequence[Answer]) -> dict[str, int]:
+    tries: dict[str, int] = {}
+    for answer in answers:
+        for unit in (answer.match.source, answer.match.target):
+            for vehicle in {submap_id[0] for submap_id in unit.ids}:
+                tries[vehicle] = tries.get(vehicle, 0) + 1
+    return tries
