@@ -101,6 +101,7 @@ class Problem:
         rounding = self._rounding(frames, math.sqrt(float(spread.max())))
         self.frames = np.column_stack([np.array(frames), rounding])
         self.arm = math.sqrt(float((weights * spread).sum() / max(float(weights.sum()), 1e-300)))
+        self.arm = max([self.arm, *(self._turning_radius(t) for t in self.terms if t.is_inverse)])
         self.reach = 5.0 * max(term.field.pitch_m for term in self.terms)
         self.arm = max(self.arm, 1e-3 * self.reach)
         self.radius = self.reach  # of the neighbourhood of an optimum
@@ -112,6 +113,16 @@ class Problem:
         self.margin = peak * (
             1e-11 * max(1.0, math.sqrt(len(stacked)) / 30.0) + 2.0 * float(rounding.max() - _CELL)
         )
+
+    def _turning_radius(self, term: Term) -> float:
+        """Mean distance of a source field's content from the centre it turns about [m]."""
+        field, square = term.field, 0.0
+        size = np.abs(field.coefficients.astype(np.float64))
+        for axis in range(2):
+            along = size.sum(axis=1 - axis)  # axis 0 counts rows, which are y
+            place = field.origin[1 - axis] + field.pitch_m * np.arange(len(along))
+            square += float((along * (place - self.source_center[1 - axis]) ** 2).sum())
+        return math.sqrt(square / max(float(size.sum()), 1e-300))
 
     def _rests(self, weights: FloatArray) -> FloatArray:
         """For every point, the most that all points after it can bring (K,)."""
