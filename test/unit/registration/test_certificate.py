@@ -156,7 +156,7 @@ KINDS = [
 ]  # fmt: skip
 
 
-def certificate(problem, terms, outcome):
+def certificate(terms, outcome):
     """Bounds of the exact sum: those of the splines, widened by what these miss."""
     slack = sum(float(term.weights.sum()) * term.field.error for term in terms)
     return outcome.lower_bound - slack, outcome.upper_bound + slack, slack
@@ -170,7 +170,7 @@ def test_bounds_enclose_the_exact_optimum(kind):
         best, _ = problem.best()
         terms = problem.terms()
         outcome = search(terms, SearchSettings(gap=GAP))
-        lower, upper, slack = certificate(problem, terms, outcome)
+        lower, upper, slack = certificate(terms, outcome)
         value = problem.values(problem.centred(outcome.T_target_source)[None])[0]
         tolerance = 1e-9 * upper
         assert outcome.status is Status.CERTIFIED
@@ -193,7 +193,7 @@ def test_both_directions_have_the_same_optimum(kind):
         directions.append(directions[0] + directions[1])
         for terms, share in zip(directions, (1.0, 1.0, 2.0), strict=True):
             outcome = search(terms, SearchSettings(gap=GAP))
-            lower, upper, slack = certificate(problem, terms, outcome)
+            lower, upper, slack = certificate(terms, outcome)
             value = problem.values(problem.centred(outcome.T_target_source)[None])[0]
             assert outcome.status is Status.CERTIFIED
             assert share * max(best, value) <= upper
@@ -220,7 +220,7 @@ def test_bounds_hold_in_a_prior_window(kind):
         inside += [pose for pose in climbed if is_inside(problem.posed(pose), prior)]
         terms = problem.terms()
         outcome = search(terms, SearchSettings(gap=GAP), prior=prior)
-        _, upper, slack = certificate(problem, terms, outcome)
+        _, upper, slack = certificate(terms, outcome)
         best = problem.values(np.array(inside)).max()
         assert outcome.status is Status.CERTIFIED
         assert is_inside(outcome.T_target_source, prior)
@@ -250,7 +250,7 @@ def test_engine_and_reference_enclose_the_same_optimum(seed):
     slow = register_reference(pair, gap=0.1, is_gap_relative=True)
     terms = problem.terms()
     outcome = search(terms, SearchSettings(gap=0.001))
-    lower, upper, _ = certificate(problem, terms, outcome)
+    lower, upper, _ = certificate(terms, outcome)
     best, _ = problem.best()
     unit = m * n  # the reference's weights sum to one
     assert slow.is_converged
@@ -316,7 +316,7 @@ def test_no_rival_is_missed_and_each_is_bounded(kind, keep):
         problem = of_kind(kind, rng)
         terms = problem.terms()
         outcome = search(terms, SearchSettings(gap=GAP, keep=keep, rival_share=8.0))
-        slack = certificate(problem, terms, outcome)[2] + 1e-9
+        slack = certificate(terms, outcome)[2] + 1e-9
         _, optima = problem.best(num_climbs=200)
         poses = np.concatenate([optima, problem.meetings(10)])
         values = problem.values(poses)
@@ -358,7 +358,7 @@ def test_rivals_out_of_budget_leave_a_true_bound():
     outcome = search(terms, SearchSettings(gap=GAP, keep=0.3, rival_share=0.1))
     assert outcome.status is Status.CERTIFIED
     assert not outcome.has_all_rivals
-    slack = certificate(problem, terms, outcome)[2] + 1e-9
+    slack = certificate(terms, outcome)[2] + 1e-9
     poses = problem.meetings()
     for value, pose in zip(problem.values(poses), poses, strict=True):
         if value > 0.5 * outcome.lower_bound:
