@@ -169,6 +169,31 @@ def test_a_mission_is_not_overwritten(tiny, capsys):
     assert "holds a mission already" in capsys.readouterr().err
 
 
+def test_an_interrupted_run_leaves_nothing_and_can_be_repeated(tmp_path):
+    folder = tmp_path / "m"
+
+    def stop(_done, _total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate_mission(folder, SHORT, progress=stop)
+    assert list(folder.iterdir()) == []
+    # Killed, it cannot clean up; the next run does.
+    (folder / ".partial" / "auv_1").mkdir(parents=True)
+    (folder / ".partial" / "auv_1" / "auv_1.mcap").write_bytes(b"half")
+    mission = simulate_mission(folder, SHORT)
+    assert not (folder / ".partial").exists()
+    assert all(bag.exists() for bag in mission.bags)
+
+
+def test_progress_is_a_bar_on_a_terminal_only(tmp_path, capsys):
+    arguments = ["--out", str(tmp_path / "m"), "--vehicles", "1", "--duration", "6"]
+    assert simulate.main([*arguments, "--processes", "1", "--beams", "64"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert 1 <= len(lines) <= 10
+    assert all(line.startswith("simulate: ") and line.endswith(" pings") for line in lines)
+
+
 def test_a_folder_without_mission_is_named(tmp_path, tiny):
     with pytest.raises(DataError, match=r"mission\.json is not a mission's description"):
         read_mission(tmp_path)

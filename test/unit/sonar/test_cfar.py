@@ -74,9 +74,18 @@ def test_impossible_rates_are_refused(rate):
 
 
 def test_adaptive_threshold_ignores_a_strong_minority(rng):
-    power = rng.uniform(1.0, 2.0, (3, 200)).astype(np.float32)
-    clean = row_ratio(power, 3.0, 0.0)[:, 50:]
+    factor, power = 3.0, rng.uniform(1.0, 2.0, (3, 200)).astype(np.float32)
+    # Every second beam is looked at: 100, of which the minority takes 10. What was the k-th of
+    # all is then one of the k-th to (k + 10)-th, whichever of them the minority has replaced.
+    ordered = np.sort(power[:, ::2].astype(float), axis=1)
+    quarter, middle, taken = 25, 50, 10
     power[:, :20] = 1000.0
-    ratio = row_ratio(power, 3.0, 0.0)
+    ratio = row_ratio(power, factor, 0.0)
     assert (ratio[:, :20] > 1.0).all()
-    np.testing.assert_allclose(ratio[:, 50:], clean, rtol=0.2)
+    low = ordered[:, middle] + factor * 2.0 * (ordered[:, middle] - ordered[:, quarter + taken])
+    high = ordered[:, middle + taken] + factor * 2.0 * (
+        ordered[:, middle + taken] - ordered[:, quarter]
+    )
+    threshold = power[:, 50:] / ratio[:, 50:]
+    assert (threshold >= low[:, None] * (1.0 - 1e-6)).all()
+    assert (threshold <= high[:, None] * (1.0 + 1e-6)).all()

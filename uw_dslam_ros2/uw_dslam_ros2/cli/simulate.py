@@ -69,17 +69,37 @@ def _config(arguments: argparse.Namespace) -> MissionConfig:
     )
 
 
+class _Progress:
+    """A bar on a terminal; elsewhere a line for each tenth of the pings."""
+
+    def __init__(self, is_quiet: bool) -> None:
+        self._is_plain = not is_quiet and not sys.stderr.isatty()
+        self._bar = tqdm(unit="ping", desc="simulate", disable=is_quiet or self._is_plain)
+        self._tenths = 0
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def __call__(self, done: int, total: int) -> None:
+        if self._is_plain:
+            tenths = 10 * done // total
+            if tenths > self._tenths:
+                self._tenths = tenths
+                print(f"simulate: {done} of {total} pings", file=sys.stderr, flush=True)
+        else:
+            self._bar.total = total
+            self._bar.update(done - self._bar.n)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command; the exit code is 2 for bad input."""
     arguments = _parser().parse_args(argv)
     try:
         config = _config(arguments)
-        with tqdm(unit="ping", desc="simulate", disable=arguments.quiet) as bar:
-
-            def progress(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
+        with _Progress(is_quiet=arguments.quiet) as progress:
             mission = simulate_mission(
                 arguments.out,
                 config,
@@ -87,6 +107,9 @@ def main(argv: list[str] | None = None) -> int:
                 num_processes=arguments.processes,
                 progress=progress,
             )
+    except KeyboardInterrupt:
+        print("simulate: interrupted; nothing is left behind", file=sys.stderr)
+        return 130
     except UwDslamError as error:
         print(f"simulate: error: {error}", file=sys.stderr)
         return 2

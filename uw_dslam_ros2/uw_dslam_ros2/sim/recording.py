@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ from uw_dslam_ros2.sim.recorder import TRUTH_STEP, VehicleRecorder
 __all__ = ["RecordedMission", "read_mission", "simulate_mission"]
 
 _CHUNK_PINGS = 40
+_PARTIAL = ".partial"
 
 Progress = Callable[[int, int], None]
 """Called with pings done and pings in all."""
@@ -63,6 +65,9 @@ def simulate_mission(
     Writes ``<vehicle>/`` (a rosbag2 folder each), ``truth/map.yaml`` (what could be seen),
     ``truth/<vehicle>.tum``, ``truth/outline.json`` and ``mission.json``.
 
+    All is written to a folder ``.partial`` inside and moved at the end, so that an interrupted run
+    leaves no half a mission; the next run begins anew.
+
     Parameters
     ----------
     folder : must not hold a mission yet; made if it is missing.
@@ -76,6 +81,32 @@ def simulate_mission(
     folder = Path(folder)
     if (folder / "mission.json").exists():
         raise DataError(f"{folder} holds a mission already; give another folder or remove it")
+    partial = folder / _PARTIAL
+    try:
+        if partial.exists():  # of a run that was killed
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True)
+        _record(partial, config, storage, num_processes, progress)
+        # The description comes last: it says that the rest is there.
+        for path in sorted(partial.iterdir(), key=lambda p: (p.name == "mission.json", p.name)):
+            target = folder / path.name
+            if target.is_dir():
+                shutil.rmtree(target)
+            path.rename(target)
+    except OSError as error:
+        raise DataError(f"{folder} cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return read_mission(folder)
+
+
+def _record(
+    folder: Path,
+    config: MissionConfig,
+    storage: str,
+    num_processes: int,
+    progress: Progress | None,
+) -> None:
     mission = plan_mission(config)
     total = sum(run.num_pings for run in mission.runs)
     done = 0
@@ -91,7 +122,6 @@ def simulate_mission(
                         progress(done, total)
                 recorder.write_until(None)
     _write_truth(folder / "truth", mission)
-    return read_mission(folder)
 
 
 ImageSource = Callable[[int, int], Iterator[SonarImage]]
