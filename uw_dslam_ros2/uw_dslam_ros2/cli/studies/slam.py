@@ -1,12 +1,14 @@
 """One vehicle's map before and after SLAM: simulated missions and Aracati 2017, with the truth.
 
-Each recording is mapped twice, by dead reckoning alone and with scan matching and loop closures.
+Each recording is mapped by every estimator: dead reckoning alone, scan matching with loop closures
+in a graph of submaps, scan matching with a particle filter.
 Without ``--data`` (or UW_DATA_DIR) the real recording is left out, and the table says so.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -50,8 +52,12 @@ __all__ = ["add_arguments", "run"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-_ESTIMATORS = ("dead_reckoning", "scan_matching")
-_TITLES = ("dead reckoning", "with SLAM")
+_TITLES = {
+    "dead_reckoning": "dead reckoning",
+    "scan_matching": "matching and loops",
+    "particle_filter": "particle filter",
+}
+_BLIND, _DEFAULT = "dead_reckoning", VehicleMapperConfig().estimator
 _WALL_TOLERANCE_M = 0.15
 
 
@@ -79,10 +85,18 @@ class _Mapped:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the study."""
-    parser.add_argument("--seeds", type=int, default=10, help="simulated missions (0: none)")
-    parser.add_argument("--place", choices=PLACES, default="harbour")
-    parser.add_argument("--duration", type=float, default=900.0, help="of each mission [s]")
+    parser.add_argument("--seeds", type=int, default=10, help="missions in the harbour (0: none)")
+    parser.add_argument("--lake-seeds", type=int, default=3, help="missions in the lake")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--duration", type=float, default=450.0, help="of each mission [s]")
     parser.add_argument("--ping-rate", type=float, default=2.0, metavar="HZ")
+    parser.add_argument(
+        "--estimators",
+        nargs="+",
+        choices=list(_TITLES),
+        default=list(_TITLES),
+        help="dead reckoning is always among them",
+    )
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder with aracati2017")
     parser.add_argument(
         "--aracati-config",
@@ -94,48 +108,59 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Map everything twice, write table and pictures."""
+    """Map everything with every estimator, write table and pictures."""
+    estimators = list(dict.fromkeys([_BLIND, *args.estimators]))
     rows = []
     with TemporaryDirectory() as work:
         for case in _cases(args, Path(work)):
-            results = [_map(case, estimator) for estimator in _ESTIMATORS]
+            results = {name: _map(case, name) for name in estimators}
             _draw(args.out / f"{case.name}.png", case, results)
-            row = _row(case, results)
-            rows.append(row)
-            print(f"{case.name}: {row['dead_reckoning_m']} m -> {row['slam_m']} m")
+            rows.append(_row(case, results))
+            print(", ".join(f"{name} {value}" for name, value in rows[-1].items()), flush=True)
+            write_csv(args.out / "slam.csv", rows)
     if not rows:
         raise DataError("nothing to map: give --seeds or --data")
-    write_csv(args.out / "slam.csv", rows)
     print_table(list(rows[0]), [list(row.values()) for row in rows])
-    simulated = [row for row in rows if row["case"].startswith(args.place)]
-    if simulated:
-        ratio = [float(row["slam_m"]) / float(row["dead_reckoning_m"]) for row in simulated]
-        total = sum(float(r["slam_m"]) ** 2 for r in simulated)
-        total /= sum(float(r["dead_reckoning_m"]) ** 2 for r in simulated)
-        print(
-            f"SLAM over dead reckoning in {len(ratio)} missions: median {np.median(ratio):.2f}, "
-            f"of all errors together {total**0.5:.2f}"
-        )
+    for place in PLACES:
+        _summarise(place, [r for r in rows if r["case"].startswith(place)], estimators)
     return 0
 
 
+def _summarise(place: str, rows: list[dict[str, Any]], estimators: list[str]) -> None:
+    """How large the errors are against those of dead reckoning."""
+    if not rows:
+        return
+    blind = np.array([float(row[_BLIND]) for row in rows])
+    for name in estimators[1:]:
+        error = np.array([float(row[name]) for row in rows])
+        pooled = float(np.sqrt((error**2).sum() / (blind**2).sum()))
+        worst = float((error - blind).max())
+        print(
+            f"{place}, {name} over dead reckoning in {len(rows)} missions: all errors together "
+            f"{pooled:.2f}, median {np.median(error / blind):.2f}; worst change {worst:+.3f} m"
+        )
+
+
 def _cases(args: argparse.Namespace, work: Path) -> Iterator[_Case]:
-    for seed in progress(range(args.seeds), text="missions"):
+    missions = [("harbour", args.first_seed + i) for i in range(args.seeds)]
+    missions += [("lake", args.first_seed + i) for i in range(args.lake_seeds)]
+    for place, seed in progress(missions, text="missions"):
         config = MissionConfig(
             seed=seed,
-            place=args.place,
+            place=place,
             num_vehicles=1,
             duration_s=args.duration,
             ping_rate_hz=args.ping_rate,
         )
-        mission = simulate_mission(work / f"seed_{seed}", config)
+        mission = simulate_mission(work / f"{place}_{seed}", config)
         yield _Case(
-            f"{args.place}_{seed}",
+            f"{place}_{seed}",
             mission.bags[0],
             VehicleMapperConfig(),
             read_tum(mission.truth_trajectories[0]),
             read_map(mission.truth_map),
         )
+        shutil.rmtree(mission.folder)
     try:
         folder = data_dir(args.data, "aracati2017")
     except DataError as error:
@@ -169,20 +194,17 @@ def _map(case: _Case, estimator: str) -> _Mapped:
     return _Mapped(trajectory, mapper.vehicle_map(), error, seconds, mapper.diagnostics())
 
 
-def _row(case: _Case, results: list[_Mapped]) -> dict[str, Any]:
-    blind, slam = results
-    stamps = slam.trajectory[0]
-    row: dict[str, Any] = {
-        "case": case.name,
-        "pings": len(stamps),
-        "dead_reckoning_m": f"{blind.error.rmse_m:.3f}",
-        "slam_m": f"{slam.error.rmse_m:.3f}",
-        "slam_max_m": f"{slam.error.max_m:.2f}",
-        "submaps": slam.diagnostics["num_submaps"],
-        "loops": slam.diagnostics["num_loops_believed"],
-        "real_time_factor": f"{(stamps[-1] - stamps[0]) * 1e-9 / slam.seconds:.0f}",
-    }
-    for prefix, result in zip(("before", "after"), results, strict=True):
+def _row(case: _Case, results: dict[str, _Mapped]) -> dict[str, Any]:
+    after = results.get(_DEFAULT, results[_BLIND])
+    stamps = after.trajectory[0]
+    length_s = (stamps[-1] - stamps[0]) * 1e-9
+    row: dict[str, Any] = {"case": case.name, "pings": len(stamps)}
+    row |= {name: f"{result.error.rmse_m:.3f}" for name, result in results.items()}
+    row["max_m"] = f"{after.error.max_m:.2f}"
+    row["submaps"] = after.diagnostics["num_submaps"]
+    row["loops"] = after.diagnostics["num_loops_believed"]
+    row["real_time_factor"] = "/".join(f"{length_s / r.seconds:.0f}" for r in results.values())
+    for prefix, result in (("before", results[_BLIND]), ("after", after)):
         row[f"iou_{prefix}"] = row[f"ssim_{prefix}"] = "-"
         if case.truth_map is not None:
             scores = compare_maps(
@@ -197,13 +219,13 @@ def _row(case: _Case, results: list[_Mapped]) -> dict[str, Any]:
     return row
 
 
-def _draw(path: Path, case: _Case, results: list[_Mapped]) -> None:
-    """Both maps in the truth's frame, with estimated and true trajectories."""
-    made, axes = figure(1, 2, width=11.0, height=5.5)
-    for axis, title, result in zip(axes[0], _TITLES, results, strict=True):
+def _draw(path: Path, case: _Case, results: dict[str, _Mapped]) -> None:
+    """All maps in the truth's frame, with estimated and true trajectories."""
+    made, axes = figure(1, len(results), width=5.0 * len(results), height=5.0)
+    for axis, (name, result) in zip(axes[0], results.items(), strict=True):
         if case.truth_map is not None:
             true = case.truth_map.spec.centers_of(np.argwhere(case.truth_map.values > 50))
-            axis.plot(*true.T, ",", color="#bbbbbb", label="true walls")
+            axis.plot(*true.T, ",", color=COLOURS[4], label="true walls")
         T_truth_odom = result.error.T_truth_map
         walls = result.map.spec.centers_of(np.argwhere(result.map.values > 65))
         axis.plot(*T_truth_odom.apply(walls).T, ",", color="black")
@@ -211,7 +233,7 @@ def _draw(path: Path, case: _Case, results: list[_Mapped]) -> None:
         true_poses, _ = interpolate_poses(case.truth, stamps)
         axis.plot(*true_poses[:, :2].T, color=COLOURS[2], lw=1.0, label="truth")
         axis.plot(*T_truth_odom.apply(poses[:, :2]).T, color=COLOURS[1], lw=0.8, label="estimate")
-        axis.set_title(f"{title}: RMSE {result.error.rmse_m:.2f} m")
+        axis.set_title(f"{_TITLES[name]}: RMSE {result.error.rmse_m:.2f} m")
         axis.set_aspect("equal")
         axis.set_xlabel("x [m]")
     axes[0, 0].set_ylabel("y [m]")

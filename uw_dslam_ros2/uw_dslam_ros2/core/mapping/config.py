@@ -83,6 +83,9 @@ class LoopConfig(Config):
     min_overlap: float = setting(
         0.3, 0.0, 1.0, "share of the points that must meet the other map to refine its pose"
     )
+    sure_overlap: float = setting(
+        0.5, 0.0, 1.0, "that share, where the engine finds the same pose but does not accept it"
+    )
     max_conflict: float = setting(
         0.2, 0.0, 1.0, "particles: share of the points on free water above which nothing matches"
     )

@@ -14,10 +14,10 @@ from uw_dslam_ros2.core.mapping.matcher import (
     match_points,
     thin,
 )
-from uw_dslam_ros2.core.mapping.rivals import has_rival
+from uw_dslam_ros2.core.mapping.rivals import conflict, has_rival
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, register_grids
-from uw_dslam_ros2.core.registration.result import PriorWindow
+from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["find_loops", "with_bend"]
@@ -27,6 +27,10 @@ FloatArray = NDArray[np.float64]
 _BEND_SHARE = 0.25
 # The proof matters less than the verdict here: the window is small and many pairs are tried.
 _DIGITS = 6
+_HOPELESS = 0.15
+_SURE_LEAD, _SURE_CONFLICT = 0.05, 0.1
+_NEAR_RAD = 0.02
+_COARSEST = 8.0
 _REGISTRATION = GridRegistrationConfig(max_boxes=20_000)
 
 
@@ -72,18 +76,45 @@ def _verified(
 ) -> tuple[SE2, FloatArray] | None:
     """``T_target_source`` and its information (3, 3), in the target frame; None if refused.
 
-    The registration engine compares walls and free water within the window that the graph
-    allows; where the same walls would fit a period further, nothing is believed. The mapper's
-    own matcher, which knows points and not cells, then refines the pose.
+    Two judges look within the window that the graph allows: the mapper's matcher at echoes, the
+    registration engine at walls and free water. The engine accepts by itself; where it does not,
+    but finds the same pose as a matcher that is sure, the two together are enough. Where the same
+    walls would fit a period further, nothing is believed.
     """
-    loop = config.loop
+    loop, fine = config.loop, config.match.sigma_m
     sigma = np.sqrt(np.diag(prior.covariance)) * loop.search_sigma
-    fine = config.match.sigma_m
+    half_width_m = np.clip(sigma[:2], 2.0 * fine, loop.max_window_m)
+    half_width_rad = float(np.clip(sigma[2], 0.05, loop.max_window_rad))
+    half_width = (float(half_width_m[0]), float(half_width_m[1]), half_width_rad)
+    guess = _matched(target, source, prior, half_width, config)
+    if guess.overlap < _HOPELESS:
+        return None
     window = PriorWindow(
-        prior.T_target_source,
-        float(np.clip(sigma[:2].max(), 4.0 * fine, loop.max_window_m)),
-        float(np.clip(sigma[2], 0.05, loop.max_window_rad)),
+        prior.T_target_source, max(float(half_width_m.max()), 4.0 * fine), half_width_rad
     )
+    T_target_source = _agreed(target, source, guess, window, config)
+    if T_target_source is None:
+        return None
+    if has_rival(target, source, T_target_source, prior, window.half_width_m, fine):
+        return None
+    near = Prior(T_target_source, np.diag([fine, fine, _NEAR_RAD]) ** 2)
+    match = _matched(target, source, near, (4.0 * fine, 4.0 * fine, 2.0 * _NEAR_RAD), config)
+    if match.overlap < loop.min_overlap:
+        return None
+    rotation = np.eye(3)
+    rotation[:2, :2] = match.T_target_source.rotation()
+    bend = target.drift + rotation @ source.drift @ rotation.T
+    return match.T_target_source, with_bend(match.information, bend)
+
+
+def _agreed(
+    target: ClosedSection,
+    source: ClosedSection,
+    guess: Match,
+    window: PriorWindow,
+    config: VehicleMapperConfig,
+) -> SE2 | None:
+    """The pose that the engine accepts, or that both judges find; None otherwise."""
     log_odds_max = config.occupancy.log_odds_max
     judged = register_grids(
         source.evidence.unpacked().to_occupancy(log_odds_max),
@@ -91,21 +122,27 @@ def _verified(
         _REGISTRATION,
         prior=window,
     )
-    if not (judged.is_accepted and _is_within(judged.T_target_source, window)):
+    if judged.is_accepted and _is_within(judged.T_target_source, window):
+        # The engine's last digits depend on how memory is aligned; the mapper's must not.
+        return SE2.from_array(np.round(judged.T_target_source.as_array(), _DIGITS))
+    if judged.verdict is not Verdict.NOT_ENOUGH_OVERLAP or not _is_sure(
+        guess, target, source, config
+    ):
         return None
-    if has_rival(target, source, judged.T_target_source, prior, window.half_width_m, fine):
-        return None
-    # The engine's last digits depend on how memory is aligned; the mapper's must not.
-    T_target_source = SE2.from_array(np.round(judged.T_target_source.as_array(), _DIGITS))
-    covariance = np.round(judged.covariance, _DIGITS) + np.diag([fine**2, fine**2, 1e-5])
-    match = _refined(target, source, Prior(T_target_source, covariance), config)
-    information = np.linalg.inv(covariance)
-    if match.overlap >= loop.min_overlap:
-        T_target_source, information = match.T_target_source, match.information
-    rotation = np.eye(3)
-    rotation[:2, :2] = T_target_source.rotation()
-    bend = target.drift + rotation @ source.drift @ rotation.T
-    return T_target_source, with_bend(information, bend)
+    distance, turn = judged.T_target_source.distance_to(guess.T_target_source)
+    is_same = distance <= 3.0 * config.match.sigma_m and turn <= _NEAR_RAD
+    return guess.T_target_source if is_same else None
+
+
+def _is_sure(
+    guess: Match, target: ClosedSection, source: ClosedSection, config: VehicleMapperConfig
+) -> bool:
+    """Whether overlap, lead over other poses and the water between the walls say so."""
+    if guess.overlap < config.loop.sure_overlap or guess.lead < _SURE_LEAD:
+        return False
+    there = conflict(target.evidence, source.points, guess.T_target_source)
+    back = conflict(source.evidence, target.points, guess.T_target_source.inverse())
+    return max(there, back) <= _SURE_CONFLICT
 
 
 def _is_within(T_target_source: SE2, window: PriorWindow) -> bool:
@@ -113,17 +150,26 @@ def _is_within(T_target_source: SE2, window: PriorWindow) -> bool:
     return distance <= 1.5 * window.half_width_m and turn <= 1.5 * window.half_width_rad
 
 
-def _refined(
-    target: ClosedSection, source: ClosedSection, prior: Prior, config: VehicleMapperConfig
+def _matched(
+    target: ClosedSection,
+    source: ClosedSection,
+    prior: Prior,
+    half_width: tuple[float, float, float],
+    config: VehicleMapperConfig,
 ) -> Match:
-    """Match of the points near a pose that is known to some decimetres."""
+    """Match of points with points within a window, from coarse to fine."""
     fine = config.match.sigma_m
-    fields = [LikelihoodField(target.points, target.weight, s) for s in (2.0 * fine, fine)]
+    sigmas = [float(np.clip(max(half_width[:2]) / 8.0, 2.0 * fine, _COARSEST * fine))]
+    while sigmas[-1] > 1.5 * fine:
+        sigmas.append(max(0.5 * sigmas[-1], fine))
+    fields = [LikelihoodField(target.points, target.weight, s) for s in sigmas]
     points, weight = thin(source.points, 1.0 - np.exp(-source.weight), fine)
     stride = max(1, -(-len(points) // config.loop.max_points))
+    # The window already says where to look; inside it the prior only breaks ties, so it is wide.
+    spread = prior.covariance * 4.0 + np.diag([fine**2, fine**2, 1e-4])
     return match_points(
-        fields, points[::stride], weight[::stride], prior, (4.0 * fine, 4.0 * fine, 0.03),
-        config.match.information_share,
+        fields, points[::stride], weight[::stride], Prior(prior.T_target_source, spread),
+        half_width, config.match.information_share,
     )  # fmt: skip
 
 
