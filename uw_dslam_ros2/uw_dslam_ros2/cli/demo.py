@@ -269,6 +269,7 @@ def _replay(
             _follow(control, player, children.check)
             control.finish_mappers(recordings.vehicles, _FINISH_TIMEOUT_S)
             steps.begin("registering", "waiting for the last registrations")
+            control.settle_queue()
             is_settled = _settle(control, steps)
             steps.begin("saving", "saving through the manager's services")
             problem = control.save_map(str(out / "global_map"))

@@ -24,7 +24,7 @@ from uw_dslam_ros2.io.bags import TransformEvent, TruthEvent, open_bag, read_eve
 from uw_dslam_ros2.io.feeding import feed
 from uw_dslam_ros2.io.settings import SettingsFile
 
-__all__ = ["OfflineConfig", "VehicleSubmaps", "map_bags", "settle", "vehicle_of_bag"]
+__all__ = ["OfflineConfig", "VehicleSubmaps", "map_bag", "map_bags", "settle", "vehicle_of_bag"]
 
 # One number, whatever the machine: which registrations are asked next depends on the answers.
 _BATCH = 4
@@ -106,7 +106,7 @@ def map_bags(
         futures = []
         for bag in bags:
             vehicle_id = vehicle_of_bag(bag)
-            futures.append(pool.submit(_map_bag, bag, vehicle_id, config.mapper[vehicle_id]))
+            futures.append(pool.submit(map_bag, bag, vehicle_id, config.mapper[vehicle_id]))
         try:
             while wait(futures, timeout=0.2).not_done:
                 if progress is not None:
@@ -142,7 +142,8 @@ def _count(number: int) -> None:
             done.value += number
 
 
-def _map_bag(bag: Path, vehicle_id: str, config: VehicleMapperConfig) -> VehicleSubmaps:
+def map_bag(bag: Path, vehicle_id: str, config: VehicleMapperConfig) -> VehicleSubmaps:
+    """Map one vehicle's bag; `DataError` where it cannot be read."""
     mapper = VehicleMapper(config, vehicle_id)
     frames = StaticFrames()
     base_frame = f"{vehicle_id}/base_link"

@@ -16,11 +16,20 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
-from uw_dslam_ros2.core.merging import Constraint, MapQueue, SubmapRecord, SubmapState
+from uw_dslam_ros2.core.merging import (
+    Constraint,
+    LoopError,
+    MapProvenance,
+    MapQueue,
+    SubmapRecord,
+    SubmapState,
+)
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.provenance import write_provenance
+from uw_dslam_ros2.io.session import UNSURE_EDGE
 from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum
 
 __all__ = ["Outcome", "RegistrationRow", "VehicleOutcome", "outcome_of", "write_outcome"]
@@ -126,6 +135,8 @@ class Outcome:
     constraints: tuple[Constraint, ...]
     global_map: OccupancyMap | None
     registrations: tuple[RegistrationRow, ...]
+    provenance: MapProvenance | None = None
+    loops: tuple[LoopError, ...] = ()
 
     @property
     def num_merged_vehicles(self) -> int:
@@ -191,6 +202,8 @@ def outcome_of(queue: MapQueue) -> Outcome:
             RegistrationRow.of(number, answer, is_used)
             for number, (answer, is_used) in enumerate(queue.answers(), start=1)
         ),
+        queue.provenance(),
+        tuple(queue.loops()),
     )
 
 
@@ -212,10 +225,14 @@ def write_outcome(folder: Path, outcome: Outcome) -> None:
 
     ``global_map.*``, ``vehicle_maps/<vehicle>.*``, ``submaps/<vehicle>_<sequence>.*`` and
     ``submaps/submaps.json``, ``trajectories/<vehicle>.tum`` (global frame) and
-    ``trajectories/<vehicle>_alone.tum``, ``pose_graph.g2o``, ``registrations.json`` and ``.csv``.
+    ``trajectories/<vehicle>_alone.tum``, ``pose_graph.g2o``, ``pose_graph.json`` (all edges, with
+    what became of them, and the cycles), ``registrations.json`` and ``.csv``,
+    ``global_map_contradictions.png`` and ``global_map_provenance.npz``.
     """
     if outcome.global_map is not None:
         write_map(folder / "global_map", outcome.global_map)
+    if outcome.provenance is not None:
+        write_provenance(folder / "global_map", outcome.provenance)
     for vehicle in outcome.vehicles:
         name = vehicle.vehicle_id
         write_map(folder / "vehicle_maps" / name, vehicle.own_map)
@@ -231,6 +248,7 @@ def write_outcome(folder: Path, outcome: Outcome) -> None:
             folder / "submaps" / "submaps.json": json_bytes(_submap_table(outcome)),
             folder / "registrations.json": json_bytes(rows),
             folder / "registrations.csv": _csv_bytes(rows),
+            folder / "pose_graph.json": json_bytes(_graph_table(outcome)),
         }
     )
     _write_graph(folder / "pose_graph.g2o", outcome)
@@ -276,6 +294,34 @@ def _submap_table(outcome: Outcome) -> list[dict[str, Any]]:
     ]
 
 
+def _graph_table(outcome: Outcome) -> dict[str, Any]:
+    """Edges with their residuals, the wrong and the unsure ones included, and cycles."""
+    return {
+        "edges": [
+            {
+                "kind": c.kind.name,
+                "source": f"{c.source[0]}/{c.source[1]}",
+                "target": f"{c.target[0]}/{c.target[1]}",
+                "T_target_source": c.T_target_source.as_array().tolist(),
+                "covariance": c.covariance.tolist(),
+                "residual_m": c.residual_m,
+                "residual_rad": c.residual_rad,
+                "is_inlier": c.is_inlier,
+                "is_unsure": c.is_unsure,
+            }
+            for c in outcome.constraints
+        ],
+        "loops": [
+            {
+                "submaps": [f"{vehicle}/{number}" for vehicle, number in loop.submaps],
+                "error_m": loop.error_m,
+                "error_deg": math.degrees(loop.error_rad),
+            }
+            for loop in outcome.loops
+        ],
+    }
+
+
 def _write_graph(path: Path, outcome: Outcome) -> None:
     """Vertices are numbered as in submaps.json; only what shares the global frame is in it."""
     numbers = {record.submap.submap_id: i for i, record in enumerate(outcome.records)}
@@ -285,7 +331,13 @@ def _write_graph(path: Path, outcome: Outcome) -> None:
         if record.state is SubmapState.MERGED
     }
     edges = [
-        PoseGraphEdge(numbers[c.target], numbers[c.source], c.T_target_source, _regular(c))
+        PoseGraphEdge(
+            numbers[c.target],
+            numbers[c.source],
+            c.T_target_source,
+            _regular(c),
+            UNSURE_EDGE if c.is_unsure else "",
+        )
         for c in outcome.constraints
         if c.is_inlier and numbers[c.source] in vertices and numbers[c.target] in vertices
     ]

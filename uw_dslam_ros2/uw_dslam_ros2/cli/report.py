@@ -16,6 +16,7 @@ from uw_dslam_ros2.cli.outcome import Outcome, json_bytes, write_outcome
 from uw_dslam_ros2.cli.scoring import Scores, Truth, score
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
+from uw_dslam_ros2.io.provenance import contradictions_png
 
 __all__ = ["RunFacts", "headline", "write_report"]
 
@@ -63,7 +64,10 @@ def write_report(
     write_files({folder / "report.json": json_bytes(report_dict(outcome, facts, scores))})
     if has_pictures:
         images = _draw(outcome, truth, scores)
-        html = render_html(outcome, facts, scores, images).encode()
+        shown = images
+        if outcome.provenance is not None:
+            shown = images | {"global_map_contradictions": contradictions_png(outcome.provenance)}
+        html = render_html(outcome, facts, scores, shown).encode()
         files = {folder / f"{name}.png": content for name, content in images.items()}
         write_files({**files, folder / "report.html": html})
     return scores

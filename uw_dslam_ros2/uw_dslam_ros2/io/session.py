@@ -28,11 +28,14 @@ from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum
 
-__all__ = ["SESSION_FILE", "export_queue", "load_session", "save_session"]
+__all__ = ["SESSION_FILE", "UNSURE_EDGE", "export_queue", "load_session", "save_session"]
 
 SESSION_FILE = "session.sqlite"
+UNSURE_EDGE = "refused by itself; believed because others agree with it"
+"""Comment on an edge of a pose graph."""
 _VERSION = 1
 _TABLES = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -98,7 +101,8 @@ def load_session(folder: str | Path, config: MapQueueConfig | None = None) -> Ma
 def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
     """Write a queue for other programs; missing folders are made.
 
-    ``map.{yaml,pgm,png}`` (global map), ``submaps/<vehicle>_<sequence>.*`` (each in its own
+    ``map.{yaml,pgm,png}`` (global map), ``map_contradictions.png`` and ``map_provenance.npz`` (who
+    saw what, see `write_provenance`), ``submaps/<vehicle>_<sequence>.*`` (each in its own
     frame), ``trajectories/<vehicle>.tum`` (merged vehicles, in "map"), ``graph.g2o`` (the global
     component, without the edges found wrong).
     """
@@ -107,6 +111,9 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
     evidence = queue.global_map()
     if evidence is not None:
         written += write_map(folder / "map", evidence.to_occupancy())
+    provenance = queue.provenance()
+    if provenance is not None:
+        written += write_provenance(folder / "map", provenance)
     records = queue.submaps()
     for record in records:
         submap = record.submap
@@ -125,6 +132,7 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
             keys[c.source],
             c.T_target_source,
             _regular(c.covariance) if c.kind is ConstraintKind.ODOMETRY else c.covariance,
+            UNSURE_EDGE if c.is_unsure else "",
         )
         for c in queue.constraints()
         if c.is_inlier and c.source in keys and c.target in keys

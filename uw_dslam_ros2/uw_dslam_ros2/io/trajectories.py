@@ -40,6 +40,7 @@ class PoseGraphEdge:
     source: int
     T_target_source: SE2
     covariance: FloatArray
+    comment: str = ""  # one line; written before the edge, and passed over by readers
 
 
 def tum_bytes(stamps_ns: IntArray, poses: FloatArray) -> bytes:
@@ -107,6 +108,8 @@ def g2o_bytes(vertices: Mapping[int, SE2], edges: Sequence[PoseGraphEdge]) -> by
         information = np.linalg.inv(to_source @ edge.covariance @ to_source.T)
         numbers = " ".join(f"{v:.12g}" for v in information[_UPPER])
         motion = edge.T_target_source
+        if edge.comment:
+            lines.append(f"# {edge.comment}\n")
         lines.append(
             f"EDGE_SE2 {edge.target} {edge.source} "
             f"{motion.x:.9g} {motion.y:.9g} {motion.yaw:.12g} {numbers}\n"

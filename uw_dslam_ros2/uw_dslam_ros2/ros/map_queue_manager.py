@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
+import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -15,31 +15,28 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.msg import Submap as SubmapMsg
-from uw_dslam_msgs.srv import (
-    GetSubmap,
-    ListSubmaps,
-    LoadSession,
-    RegisterMaps,
-    RestoreSubmap,
-    SaveMap,
-    SaveSession,
-    WithdrawSubmap,
-)
+from uw_dslam_msgs.srv import RegisterMaps
 from visualization_msgs.msg import MarkerArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
-from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest, SubmapState
+from uw_dslam_ros2.core.merging import (
+    Constraint,
+    ConstraintKind,
+    MapQueue,
+    MapQueueConfig,
+    MatchRequest,
+    SubmapState,
+)
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.maps import write_map
-from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, load_session, save_session
+from uw_dslam_ros2.io.session import load_session, save_session
+from uw_dslam_ros2.ros.arrivals import Arrivals
 from uw_dslam_ros2.ros.conversions import (
     occupancy_to_msg,
     options_to_msg,
     refused_registration,
     registration_from_msg,
     submap_from_msg,
-    submap_to_msg,
 )
 from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
@@ -52,6 +49,7 @@ from uw_dslam_ros2.ros.merge_messages import (
 from uw_dslam_ros2.ros.node_settings import MapQueueManagerConfig
 from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.qos import LATCHED, SUBMAPS
+from uw_dslam_ros2.ros.queue_services import QueueServices, has_session
 from uw_dslam_ros2.ros.registration_clients import RegistrationClients
 from uw_dslam_ros2.ros.running import run_node
 from uw_dslam_ros2.ros.worker import Worker
@@ -62,7 +60,8 @@ _SUBMAP_TYPE = "uw_dslam_msgs/msg/Submap"
 _TICK_S = 0.1
 _STATUS_PERIOD_S = 1.0
 _DISCOVERY_PERIOD_S = 0.5
-_SERVICE_TIMEOUT_S = 600.0
+_SEARCH_SHARE = 0.8
+"""Of the time after which a request counts as lost, what a search may take."""
 
 
 class MapQueueManager(Node):
@@ -77,6 +76,7 @@ class MapQueueManager(Node):
         refuse_unknown_parameters(self)
         self._queue = MapQueue(self._queue_config)
         self._message = "waiting for submaps"
+        self._arrivals = Arrivals(self._config.quiet_s)
         self._counts: Counter[str] = Counter()
         self._values: dict[str, float | int | str] = {}
         self._asked: dict[int, MatchRequest] = {}
@@ -104,7 +104,7 @@ class MapQueueManager(Node):
         )
         for vehicle_id in self._config.vehicles:
             self._subscribe(f"/{vehicle_id.strip('/')}/submap")
-        self._create_services()
+        QueueServices(self, self, self._worker, self._group)
         self._diagnostics = Diagnostics(self, self._report, self._config.map_frame)
         # Steady: registrations go on when a replay and its clock have ended.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -121,23 +121,6 @@ class MapQueueManager(Node):
         """Stop, then destroy."""
         self.stop()
         super().destroy_node()
-
-    def _create_services(self) -> None:
-        for service_type, name, handler in (
-            (SaveMap, "save_map", self._save_map),
-            (ListSubmaps, "list_submaps", self._list_submaps),
-            (GetSubmap, "get_submap", self._get_submap),
-            (WithdrawSubmap, "withdraw_submap", self._withdraw_submap),
-            (RestoreSubmap, "restore_submap", self._restore_submap),
-            (SaveSession, "save_session", self._save_session),
-            (LoadSession, "load_session", self._load_session),
-        ):
-            self.create_service(
-                service_type,
-                f"~/{name}",
-                functools.partial(self._serve, handler),
-                callback_group=self._group,
-            )
 
     # --- callbacks ---------------------------------------------------------------------------
 
@@ -159,17 +142,18 @@ class MapQueueManager(Node):
         try:
             submap = submap_from_msg(msg)
         except InvalidInputError as error:
-            self._complain(f"bad submap on {topic}: {error}")
+            self.complain(f"bad submap on {topic}: {error}")
             return
         self._worker.post(lambda: self._add_submap(topic, submap))
 
-    def _complain(self, text: str) -> None:
+    def complain(self, text: str) -> None:
+        """Tell of something wrong that came from outside."""
         self._counts["num_bad"] += 1
         self._message = text
         self.get_logger().error(text, throttle_duration_sec=WARNING_PERIOD_S)
 
     def _on_worker_error(self, error: Exception) -> None:
-        self._complain(f"{type(error).__name__}: {error}")
+        self.complain(f"{type(error).__name__}: {error}")
 
     def _on_tick(self) -> None:
         # While the worker is busy, ticks must not pile up.
@@ -177,29 +161,22 @@ class MapQueueManager(Node):
             self._is_tick_posted.set()
             self._worker.post(self._tick)
 
-    def _serve(self, handler: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
-        try:
-            job = self._worker.call(lambda: handler(request, response))
-            job.result(_SERVICE_TIMEOUT_S)
-        except Exception as error:  # noqa: BLE001 (a bad request must not end the node)
-            self._complain(f"{type(request).__name__}: {error}")
-            if hasattr(response, "FAILED"):
-                response.result = response.FAILED
-            if hasattr(response, "message"):
-                response.message = f"{type(error).__name__}: {error}"
-        return response
-
     # --- in the worker's thread: submaps and registrations -----------------------------------
 
     def _add_submap(self, topic: str, submap: Submap) -> None:
         try:
-            self._queue.add_submap(submap)
+            is_new = self._queue.add_submap(submap)
         except InvalidInputError as error:
-            self._complain(f"submap refused on {topic}: {error}")
+            self.complain(f"submap refused on {topic}: {error}")
             return
-        self._changed(f"{submap.vehicle_id}/{submap.sequence} revision {submap.revision} received")
+        if not is_new:
+            self._counts["num_repeated"] += 1
+            return
+        self._arrivals.note(time.monotonic())
+        self.changed(f"{submap.vehicle_id}/{submap.sequence} revision {submap.revision} received")
 
-    def _changed(self, message: str) -> None:
+    def changed(self, message: str) -> None:
+        """Note that the queue was changed."""
         self._message = message
         self._is_changed = True
         self._is_saved = False
@@ -212,6 +189,7 @@ class MapQueueManager(Node):
             self._discover()
         for request_id, reason in self._servers.take_lost():
             self._ask_again(request_id, reason)
+        self._queue.is_growing = self._arrivals.is_growing(now_s)
         self._ask()
         if self._is_changed and now_s - self._published_s >= self._config.publish_period_s:
             self._is_changed = False
@@ -238,7 +216,10 @@ class MapQueueManager(Node):
         if room <= 0:
             return
         for request in self._queue.next_requests(room):
-            msg = RegisterMaps.Request(options=options_to_msg(request.prior))
+            # A server's own time limit would let a busy machine refuse what a quiet one accepts;
+            # the number of boxes decides, and this is for what never ends.
+            max_seconds = _SEARCH_SHARE * self._config.request_timeout_s
+            msg = RegisterMaps.Request(options=options_to_msg(request.prior, max_seconds))
             frames = (_frame_of(request.source_reference), _frame_of(request.target_reference))
             msg.source = occupancy_to_msg(request.source, frames[0], 0)
             msg.target = occupancy_to_msg(request.target, frames[1], 0)
@@ -265,7 +246,7 @@ class MapQueueManager(Node):
         self._counts[f"num_{result.verdict.name.lower()}"] += 1
         self._queue.add_result(request_id, result)
         pair = f"{_names(request.source_ids)} to {_names(request.target_ids)}"
-        self._changed(f"{pair}: {result.verdict.name}: {result.reason}")
+        self.changed(f"{pair}: {result.verdict.name}: {result.reason}")
         self.get_logger().info(self._message)
 
     def _ask_again(self, request_id: int, reason: str) -> None:
@@ -317,6 +298,23 @@ class MapQueueManager(Node):
         }
         self._values |= {"num_in_flight": msg.num_in_flight, "num_servers": msg.num_servers}
         self._values["num_submaps"] = len(records)
+        self._values["is_growing"] = int(self._queue.is_growing)
+        self._values |= self._residuals(constraints)
+
+    def _residuals(self, constraints: Sequence[Constraint]) -> dict[str, float | int | str]:
+        """How well edges and cycles close, for the diagnostics."""
+        edges = [c for c in constraints if c.kind is ConstraintKind.REGISTRATION]
+        loops = self._queue.loops()
+        return {
+            "num_edges": sum(c.is_inlier for c in edges),
+            "num_edges_unsure": sum(c.is_inlier and c.is_unsure for c in edges),
+            "num_edges_rejected": sum(not c.is_inlier for c in edges),
+            "num_loops": len(loops),
+            "loop_error_max_m": max((loop.error_m for loop in loops), default=0.0),
+            "loop_error_max_deg": math.degrees(
+                max((loop.error_rad for loop in loops), default=0.0)
+            ),
+        }
 
     def _publish_transforms(self) -> None:
         """Map -> <vehicle>/map of the merged ones: when the clock moves, or a new reader comes."""
@@ -337,77 +335,26 @@ class MapQueueManager(Node):
             *(transform_to_msg(stamp, frame_id, f"{name}/map", T) for name, T in places)
         )
 
-    # --- in the worker's thread: services ----------------------------------------------------
+    # --- what the services ask for -----------------------------------------------------------
 
-    def _save_map(self, request: SaveMap.Request, response: SaveMap.Response) -> None:
-        evidence = self._queue.global_map()
-        if evidence is None:
-            response.result = response.NOTHING_TO_SAVE
-            response.message = "no submap received yet"
-            return
-        if not request.path:
-            raise InvalidInputError("path is empty, expected a file name without an ending")
-        response.files = [str(path) for path in write_map(request.path, evidence.to_occupancy())]
-        response.result = response.DONE
-        response.message = f"{len(response.files)} files written"
+    @property
+    def queue(self) -> MapQueue:
+        """The queue as it is now."""
+        return self._queue
 
-    def _list_submaps(self, request: ListSubmaps.Request, response: ListSubmaps.Response) -> None:
-        response.submaps = [
-            record_to_msg(record)
-            for record in self._queue.submaps()
-            if request.vehicle_id in ("", record.submap.vehicle_id)
-        ]
-
-    def _get_submap(self, request: GetSubmap.Request, response: GetSubmap.Response) -> None:
-        submap_id = (request.vehicle_id, int(request.sequence))
-        for record in self._queue.submaps():
-            if record.submap.submap_id == submap_id:
-                response.result = response.DONE
-                response.submap = submap_to_msg(record.submap)
-                response.info = record_to_msg(record)
-                return
-        response.result = response.NOT_FOUND
-        response.message = _not_found(submap_id)
-
-    def _withdraw_submap(self, request: Any, response: Any) -> None:
-        self._switch(request, response, self._queue.withdraw, "withdrawn")
-
-    def _restore_submap(self, request: Any, response: Any) -> None:
-        self._switch(request, response, self._queue.restore, "back in the queue")
-
-    def _switch(
-        self, request: Any, response: Any, act: Callable[[SubmapId], bool], word: str
-    ) -> None:
-        submap_id = (request.vehicle_id, int(request.sequence))
-        if not act(submap_id):
-            response.result, response.message = response.NOT_FOUND, _not_found(submap_id)
-            return
-        response.result = response.DONE
-        response.message = f"{request.vehicle_id}/{request.sequence} {word}"
-        self._changed(response.message)
-
-    def _save_session(self, request: SaveSession.Request, response: SaveSession.Response) -> None:
-        if not request.path:
-            raise InvalidInputError("path is empty, expected a folder")
-        paths = [save_session(request.path, self._queue), *export_queue(request.path, self._queue)]
-        response.files = [str(path) for path in paths]
-        response.result = response.DONE
-        response.message = f"{len(response.files)} files written"
-
-    def _load_session(self, request: LoadSession.Request, response: LoadSession.Response) -> None:
-        if not has_session(request.path):
-            response.result = response.NOT_FOUND
-            response.message = f"there is no {SESSION_FILE} in {request.path!r}"
-            return
-        queue = load_session(request.path, self._queue_config)
+    def resume(self, path: str) -> MapQueue:
+        """Go on with the session in a folder, in the place of the queue."""
+        queue = load_session(path, self._queue_config)
         self._servers.forget_all()
         self._asked.clear()
         self._queue = queue
         self._map.clear()
-        response.result = response.DONE
-        response.num_submaps = len(queue.submaps())
-        response.message = f"{response.num_submaps} submaps loaded"
-        self._changed(response.message)
+        return queue
+
+    def settle(self) -> None:
+        """No more submaps are expected: ask all that is left."""
+        self._arrivals.end()
+        self._tick()
 
     def _resume(self, path: str) -> None:
         """Go on where a session ended; a damaged one ends the start with a clear sentence."""
@@ -426,11 +373,6 @@ class MapQueueManager(Node):
         return is_well, self._message if is_well else "no registration server on the graph", values
 
 
-def has_session(path: str) -> bool:
-    """Whether a folder holds a session."""
-    return (Path(path) / SESSION_FILE).is_file()
-
-
 def _frame_of(submap_id: SubmapId) -> str:
     return f"{submap_id[0]}/submap_{submap_id[1]}"
 
@@ -438,10 +380,6 @@ def _frame_of(submap_id: SubmapId) -> str:
 def _names(submap_ids: Sequence[SubmapId]) -> str:
     first = f"{submap_ids[0][0]}/{submap_ids[0][1]}"
     return first if len(submap_ids) == 1 else f"{first} and {len(submap_ids) - 1} more"
-
-
-def _not_found(submap_id: SubmapId) -> str:
-    return f"no submap {submap_id[0]}/{submap_id[1]}; ~/list_submaps lists them"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

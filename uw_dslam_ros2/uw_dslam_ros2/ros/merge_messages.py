@@ -29,6 +29,7 @@ _LINE_WIDTH_M = 0.15
 _TEXT_HEIGHT_M = 1.2
 _ODOMETRY_COLOR = (0.6, 0.6, 0.6, 1.0)
 _INLIER_COLOR = (0.1, 0.7, 0.2, 1.0)
+_UNSURE_COLOR = (0.95, 0.75, 0.1, 1.0)
 _OUTLIER_COLOR = (0.9, 0.1, 0.1, 0.6)
 _VEHICLE_COLORS = (
     (0.12, 0.47, 0.71, 1.0),
@@ -77,7 +78,11 @@ def graph_to_markers(
     frame_id: str,
     stamp: TimeMsg,
 ) -> MarkerArray:
-    """Merged submaps as spheres in their vehicle's colour, edges as lines: rejected ones red."""
+    """Merged submaps as spheres in their vehicle's colour, edges as lines.
+
+    Odometry is grey, registrations are green, yellow where the answer was unsure alone, red where
+    rejected.
+    """
     merged = {
         record.submap.submap_id: record.T_component_submap
         for record in records
@@ -113,12 +118,15 @@ def _edge_markers(
     lines: dict[str, tuple[tuple[float, float, float, float], list[Point]]] = {
         "odometry": (_ODOMETRY_COLOR, []),
         "registrations": (_INLIER_COLOR, []),
+        "unsure": (_UNSURE_COLOR, []),
         "rejected": (_OUTLIER_COLOR, []),
     }
     for constraint in constraints:
         if constraint.source not in merged or constraint.target not in merged:
             continue
         name = "odometry" if constraint.kind == ConstraintKind.ODOMETRY else "registrations"
+        if constraint.is_unsure:
+            name = "unsure"
         points = lines[name if constraint.is_inlier else "rejected"][1]
         points += [_point(merged[constraint.source]), _point(merged[constraint.target])]
     markers = []

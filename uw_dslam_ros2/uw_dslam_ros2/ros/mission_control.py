@@ -113,8 +113,13 @@ class MissionControl:
             if not response.success:
                 raise DataError(f"{vehicle} could not finish its map: {response.message}")
             answers[vehicle] = response.message
-        self._changed_s = time.monotonic()
         return answers
+
+    def settle_queue(self, timeout_s: float = 60.0) -> None:
+        """Tell the manager that no more submaps are expected."""
+        future = self._call(Trigger, f"{_MANAGER}/settle", Trigger.Request())
+        self.wait_until(future.done, "the queue's settling", timeout_s)
+        self._changed_s = time.monotonic()
 
     def wait_until_settled(self, timeout_s: float, show: Callable[[MergeStatus], None]) -> bool:
         """Wait until the queue asks nothing and changes no more; False at the time limit."""

@@ -85,6 +85,13 @@ class MapQueueManagerConfig(Config):
     request_timeout_s: float = setting(
         180.0, 0.1, 86400.0, "a registration not answered by then is asked again [s]"
     )
+    quiet_s: float = setting(
+        0.0,
+        0.0,
+        3600.0,
+        "without a new submap for this long, all that is left is asked [s]; 0: twice the longest "
+        "time between two so far, 3 to 120 s",
+    )
     publish_period_s: float = setting(
         1.0, 0.0, 3600.0, "least time between two global maps, by a steady clock [s]"
     )

@@ -10,6 +10,7 @@ registrations come from the true poses with noise, and a share of them can be wr
 from __future__ import annotations
 
 import argparse
+import hashlib
 from collections.abc import Callable
 from typing import Any
 
@@ -30,7 +31,15 @@ from uw_dslam_ros2.sim.fleets import Fleet, KnowingMatcher, answer_all, lawnmowe
 __all__ = ["add_arguments", "run"]
 
 _MODES = ("pairwise", "graph")
-_HEADERS = ("mode", "median [m]", "worst [m]", "spread over orders [m]", "merged", "searches")
+_HEADERS = (
+    "mode",
+    "median [m]",
+    "worst [m]",
+    "spread over orders [m]",
+    "merged",
+    "searches",
+    "distinct maps",
+)
 Matcher = Callable[[MatchRequest], RegistrationResult]
 
 
@@ -90,7 +99,8 @@ def _trial(fleet: Fleet, matcher: Matcher, seed: int, order: int, mode: str) -> 
     rng = np.random.default_rng([seed, order])
     vehicles = sorted({submap_id[0] for submap_id in fleet.submaps})
     shuffled = [vehicles[i] for i in rng.permutation(len(vehicles))]
-    queue = MapQueue(MapQueueConfig(mode=mode))
+    # The frame is pinned by name, so that equal results are equal bytes.
+    queue = MapQueue(MapQueueConfig(mode=mode, anchor_vehicle=vehicles[0]))
     for vehicle in shuffled:
         for submap_id in sorted(i for i in fleet.submaps if i[0] == vehicle):
             queue.add_submap(fleet.submaps[submap_id])
@@ -103,7 +113,15 @@ def _trial(fleet: Fleet, matcher: Matcher, seed: int, order: int, mode: str) -> 
         "rmse_m": round(fleet.position_rmse_m(queue), 4),
         "merged_share": round(len(merged) / len(fleet.submaps), 3),
         "num_searches": num_searches,
+        "map_digest": _digest_of(queue),
     }
+
+
+def _digest_of(queue: MapQueue) -> str:
+    evidence = queue.global_map()
+    assert evidence is not None
+    content = evidence.log_odds.tobytes() + evidence.observed.tobytes()
+    return hashlib.blake2b(repr(evidence.spec).encode() + content, digest_size=8).hexdigest()
 
 
 def _draw(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
@@ -129,6 +147,7 @@ def _report(rows: list[dict[str, Any]]) -> None:
         places = sorted({row["place"] for row in of_mode})
         spreads = [np.ptp([r["rmse_m"] for r in of_mode if r["place"] == p]) for p in places]
         errors = [row["rmse_m"] for row in of_mode]
+        digests = [len({r["map_digest"] for r in of_mode if r["place"] == p}) for p in places]
         table.append(
             (
                 mode,
@@ -137,6 +156,7 @@ def _report(rows: list[dict[str, Any]]) -> None:
                 f"{np.mean(spreads):.4f}",
                 f"{np.mean([row['merged_share'] for row in of_mode]):.2f}",
                 f"{np.mean([row['num_searches'] for row in of_mode]):.1f}",
+                f"{np.mean(digests):.1f}",
             )
         )
     print_table(_HEADERS, table)

@@ -3,6 +3,7 @@
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Mosaic, Window
 from uw_dslam_ros2.core.merging.queue import MapQueue
+from uw_dslam_ros2.core.merging.settling import LoopError
 from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
@@ -16,6 +17,7 @@ from uw_dslam_ros2.core.merging.types import (
 __all__ = [
     "Constraint",
     "ConstraintKind",
+    "LoopError",
     "MapProvenance",
     "MapQueue",
     "MapQueueConfig",

@@ -62,8 +62,13 @@ class MapQueue:
         self._is_growing = False
         self._is_drawn = False
 
-    def add_submap(self, submap: Submap) -> None:
+    def add_submap(self, submap: Submap) -> bool:
         """Take a submap; a higher revision replaces, an equal or lower one changes nothing.
+
+        Returns
+        -------
+        bool
+            Whether it was new.
 
         Raises
         ------
@@ -80,7 +85,7 @@ class MapQueue:
                     f"submap {submap.vehicle_id}/{submap.sequence} revision {submap.revision} "
                     "differs from the one received before: are there two vehicles of this name?"
                 )
-            return
+            return False
         self._submaps[submap.submap_id] = stored
         if submap.vehicle_id not in self._vehicles:
             self._vehicles.append(submap.vehicle_id)
@@ -90,6 +95,7 @@ class MapQueue:
             resolution_m = self._config.resolution_m or submap.grid.spec.resolution_m
             self._lattice = pinned_lattice(submap.grid.spec, resolution_m)
         self._change()
+        return True
 
     def next_requests(self, max_requests: int) -> list[MatchRequest]:
         """Give up to so many registrations to ask for now, most useful first.

@@ -1,0 +1,178 @@
+"""The services of the map queue manager."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+from uw_dslam_msgs.srv import (
+    GetSubmap,
+    ListSubmaps,
+    LoadSession,
+    RestoreSubmap,
+    SaveMap,
+    SaveSession,
+    WithdrawSubmap,
+)
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.mapping.submap import SubmapId
+from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.provenance import write_provenance
+from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, save_session
+from uw_dslam_ros2.ros.conversions import submap_to_msg
+from uw_dslam_ros2.ros.merge_messages import record_to_msg
+from uw_dslam_ros2.ros.worker import Worker
+
+__all__ = ["QueueOwner", "QueueServices", "has_session"]
+
+_TIMEOUT_S = 600.0
+
+
+class QueueOwner(Protocol):
+    """What the services need of the manager; called in the worker's thread, but `complain`."""
+
+    @property
+    def queue(self) -> MapQueue:
+        """The queue as it is now."""
+        ...
+
+    def changed(self, message: str) -> None:
+        """The queue was changed."""
+        ...
+
+    def resume(self, path: str) -> MapQueue:
+        """Go on with the session in a folder, in the place of the queue."""
+        ...
+
+    def settle(self) -> None:
+        """No more submaps are expected."""
+        ...
+
+    def complain(self, text: str) -> None:
+        """Something was wrong that came from outside."""
+        ...
+
+
+class QueueServices:
+    """Serves in the worker's thread, so that no request meets a queue in mid-change."""
+
+    def __init__(
+        self, node: Node, owner: QueueOwner, worker: Worker, group: ReentrantCallbackGroup
+    ) -> None:
+        self._owner, self._worker = owner, worker
+        for service_type, name, handler in (
+            (SaveMap, "save_map", self._save_map),
+            (ListSubmaps, "list_submaps", self._list_submaps),
+            (GetSubmap, "get_submap", self._get_submap),
+            (WithdrawSubmap, "withdraw_submap", self._withdraw_submap),
+            (RestoreSubmap, "restore_submap", self._restore_submap),
+            (SaveSession, "save_session", self._save_session),
+            (LoadSession, "load_session", self._load_session),
+            (Trigger, "settle", self._settle),
+        ):
+            serve = functools.partial(self._serve, handler)
+            node.create_service(service_type, f"~/{name}", serve, callback_group=group)
+
+    def _serve(self, handler: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
+        try:
+            job = self._worker.call(lambda: handler(request, response))
+            job.result(_TIMEOUT_S)
+        except Exception as error:  # noqa: BLE001 (a bad request must not end the node)
+            self._owner.complain(f"{type(request).__name__}: {error}")
+            if hasattr(response, "FAILED"):
+                response.result = response.FAILED
+            if hasattr(response, "message"):
+                response.message = f"{type(error).__name__}: {error}"
+        return response
+
+    def _save_map(self, request: SaveMap.Request, response: SaveMap.Response) -> None:
+        evidence = self._owner.queue.global_map()
+        if evidence is None:
+            response.result = response.NOTHING_TO_SAVE
+            response.message = "no submap received yet"
+            return
+        if not request.path:
+            raise InvalidInputError("path is empty, expected a file name without an ending")
+        paths = write_map(request.path, evidence.to_occupancy())
+        provenance = self._owner.queue.provenance()
+        if provenance is not None:
+            paths += write_provenance(request.path, provenance)
+        response.files = [str(path) for path in paths]
+        response.result = response.DONE
+        response.message = f"{len(response.files)} files written"
+
+    def _list_submaps(self, request: ListSubmaps.Request, response: ListSubmaps.Response) -> None:
+        response.submaps = [
+            record_to_msg(record)
+            for record in self._owner.queue.submaps()
+            if request.vehicle_id in ("", record.submap.vehicle_id)
+        ]
+
+    def _get_submap(self, request: GetSubmap.Request, response: GetSubmap.Response) -> None:
+        submap_id = (request.vehicle_id, int(request.sequence))
+        for record in self._owner.queue.submaps():
+            if record.submap.submap_id == submap_id:
+                response.result = response.DONE
+                response.submap = submap_to_msg(record.submap)
+                response.info = record_to_msg(record)
+                return
+        response.result = response.NOT_FOUND
+        response.message = _not_found(submap_id)
+
+    def _withdraw_submap(self, request: Any, response: Any) -> None:
+        self._switch(request, response, self._owner.queue.withdraw, "withdrawn")
+
+    def _restore_submap(self, request: Any, response: Any) -> None:
+        self._switch(request, response, self._owner.queue.restore, "back in the queue")
+
+    def _switch(
+        self, request: Any, response: Any, act: Callable[[SubmapId], bool], word: str
+    ) -> None:
+        submap_id = (request.vehicle_id, int(request.sequence))
+        if not act(submap_id):
+            response.result, response.message = response.NOT_FOUND, _not_found(submap_id)
+            return
+        response.result = response.DONE
+        response.message = f"{request.vehicle_id}/{request.sequence} {word}"
+        self._owner.changed(response.message)
+
+    def _save_session(self, request: SaveSession.Request, response: SaveSession.Response) -> None:
+        if not request.path:
+            raise InvalidInputError("path is empty, expected a folder")
+        queue = self._owner.queue
+        paths = [save_session(request.path, queue), *export_queue(request.path, queue)]
+        response.files = [str(path) for path in paths]
+        response.result = response.DONE
+        response.message = f"{len(response.files)} files written"
+
+    def _load_session(self, request: LoadSession.Request, response: LoadSession.Response) -> None:
+        if not has_session(request.path):
+            response.result = response.NOT_FOUND
+            response.message = f"there is no {SESSION_FILE} in {request.path!r}"
+            return
+        queue = self._owner.resume(request.path)
+        response.result = response.DONE
+        response.num_submaps = len(queue.submaps())
+        response.message = f"{response.num_submaps} submaps loaded"
+        self._owner.changed(response.message)
+
+    def _settle(self, _: Trigger.Request, response: Trigger.Response) -> None:
+        self._owner.settle()
+        response.success = True
+        response.message = "what is left to match is asked now"
+
+
+def has_session(path: str) -> bool:
+    """Whether a folder holds a session."""
+    return (Path(path) / SESSION_FILE).is_file()
+
+
+def _not_found(submap_id: SubmapId) -> str:
+    return f"no submap {submap_id[0]}/{submap_id[1]}; ~/list_submaps lists them"
