@@ -13,6 +13,9 @@ from uw_dslam_ros2.core.registration.result import Verdict
 
 __all__ = ["PoseHypothesis", "decide_points", "posterior"]
 
+# Odds, before anything is seen, of two sets with nothing in common against two that have a pose.
+_CHANCE = 0.05
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseHypothesis:
@@ -26,7 +29,7 @@ def posterior(evidences: Sequence[float]) -> float:
     """Probability of the first hypothesis against all others and against chance (evidence 0)."""
     top = max(0.0, *evidences)
     terms = [math.exp(evidence - top) for evidence in evidences]
-    return terms[0] / (math.exp(-top) + sum(terms))
+    return terms[0] / (_CHANCE * math.exp(-top) + sum(terms))
 
 
 def decide_points(
@@ -57,7 +60,7 @@ def decide_points(
     if against_chance < min_probability:
         reason = (
             f"the best alignment is no better than chance: evidence {best.evidence:.1f} nats, "
-            f"{math.log(min_probability / (1.0 - min_probability)):.1f} needed"
+            f"{math.log(_CHANCE * min_probability / (1.0 - min_probability)):.1f} needed"
         )
         return Verdict.NOT_ENOUGH_OVERLAP, reason, probability
     if worst > 0.5 * spacing_m:

@@ -1,5 +1,12 @@
 # mypy: allow-untyped-defs
-"""Compiled expectation and maximisation over pose, noise and clutter share."""
+"""Compiled expectation and maximisation over pose, noise and number of pairs.
+
+Source and target points are paired one to one, some of them: every set of pairs weighs the product
+of its pairs' activities, and `_couple` sums over all sets by belief propagation (the Bethe
+approximation of the monomer-dimer model). Pairs within reach are kept as a list sorted by source:
+``first`` (m + 1,), then ``partner``, ``dx``, ``dy`` of each pair. ``state`` is theta, x, y, sigma
+and the number of pairs.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +16,8 @@ import numpy as np
 from numba import njit
 
 __all__ = ["expectation_maximisation"]
+
+_CUT = 4.0  # standard deviations beyond which no pair is looked at
 
 
 @njit(cache=True, nogil=True)
@@ -24,135 +33,197 @@ def _first_at_least(target, value):
 
 
 @njit(cache=True, nogil=True)
-def _expect(source, source_weights, target, target_weights, area, state, partner):
-    """Likelihood; per source point the weight of its partner, the partner, and the spread."""
-    theta, tx, ty, sigma, share = state[0], state[1], state[2], state[3], state[4]
-    cos, sin = math.cos(theta), math.sin(theta)
-    cut = 4.5 * sigma
-    density = share * area / (target.shape[0] * 2.0 * math.pi * sigma * sigma)
-    scale = -0.5 / (sigma * sigma)
-    value = 0.0
+def _near_pairs(source, target, state, cut, first, partner, dx, dy):
+    """List the pairs within `cut`; their number, or -1 where the arrays are too short."""
+    cos, sin = math.cos(state[0]), math.sin(state[0])
+    count = 0
     for i in range(source.shape[0]):
-        px = cos * source[i, 0] - sin * source[i, 1] + tx
-        py = sin * source[i, 0] + cos * source[i, 1] + ty
-        total, mean_x, mean_y, square = 0.0, 0.0, 0.0, 0.0
+        px = cos * source[i, 0] - sin * source[i, 1] + state[1]
+        py = sin * source[i, 0] + cos * source[i, 1] + state[2]
         for j in range(_first_at_least(target, px - cut), target.shape[0]):
-            dx = target[j, 0] - px
-            if dx > cut:
+            ex = target[j, 0] - px
+            if ex > cut:
                 break
-            dy = target[j, 1] - py
-            if dy > cut or dy < -cut:
+            ey = target[j, 1] - py
+            if ex * ex + ey * ey > cut * cut:
                 continue
-            weight = target_weights[j] * math.exp(scale * (dx * dx + dy * dy))
-            total += weight
-            mean_x += weight * dx
-            mean_y += weight * dy
-            square += weight * (dx * dx + dy * dy)
-        ratio = 1.0 - share + density * total
-        value += source_weights[i] * math.log(ratio)
-        part = density / ratio
-        partner[i, 0] = source_weights[i] * part * total
-        if total > 0.0:
-            partner[i, 1] = px + mean_x / total
-            partner[i, 2] = py + mean_y / total
-        partner[i, 3] = source_weights[i] * part * square
-        partner[i, 4], partner[i, 5] = px, py
+            if count == partner.shape[0]:
+                return -1
+            partner[count], dx[count], dy[count] = j, ex, ey
+            count += 1
+        first[i + 1] = count
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _couple(first, partner, activity, count, probability, free, load, max_sweeps):
+    """Log of the sum over all sets of pairs; fills each pair's probability.
+
+    ``free`` and ``load`` are room for the messages: the chance that a target is free without the
+    source that asks, and the activity that a target attracts.
+    """
+    num_sources = first.shape[0] - 1
+    free[:count] = 1.0
+    for _ in range(max_sweeps):
+        for e in range(count):
+            load[partner[e]] = 0.0
+        for i in range(num_sources):
+            total = 1.0
+            for e in range(first[i], first[i + 1]):
+                total += activity[e] * free[e]
+            for e in range(first[i], first[i + 1]):
+                # For now the probability holds the message back: the source is free without e.
+                probability[e] = 1.0 / (total - activity[e] * free[e])
+                load[partner[e]] += activity[e] * probability[e]
+        change = 0.0
+        for e in range(count):
+            message = 1.0 / (1.0 + max(load[partner[e]] - activity[e] * probability[e], 0.0))
+            change = max(change, abs(message - free[e]))
+            free[e] = message
+        if change < 1e-3:
+            break
+    value = 0.0
+    for i in range(num_sources):
+        total = 1.0
+        for e in range(first[i], first[i + 1]):
+            total += activity[e] * free[e]
+        value += math.log(total)
+    for e in range(count):
+        if load[partner[e]] > 0.0:
+            value += math.log(1.0 + load[partner[e]])
+            load[partner[e]] = 0.0
+    for e in range(count):
+        ratio = activity[e] * probability[e] * free[e]
+        probability[e] = ratio / (1.0 + ratio)
+        value -= math.log(1.0 + ratio)
     return value
+
+
+@njit(cache=True, nogil=True)
+def _log_choices(num_source, num_target, num_pairs):
+    """Log of the number of ways to choose that many pairs."""
+    return (
+        math.lgamma(num_source + 1.0)
+        - math.lgamma(num_source - num_pairs + 1.0)
+        - math.lgamma(num_pairs + 1.0)
+        + math.lgamma(num_target + 1.0)
+        - math.lgamma(num_target - num_pairs + 1.0)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _improve(source, target, first, partner, probability, min_sigma, max_sigma, state):
+    """Weighted Procrustes, then noise and number of pairs, into ``state``; how far it moved."""
+    total, ax, ay, bx, by = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(source.shape[0]):
+        for e in range(first[i], first[i + 1]):
+            p = probability[e]
+            total += p
+            ax += p * source[i, 0]
+            ay += p * source[i, 1]
+            bx += p * target[partner[e], 0]
+            by += p * target[partner[e], 1]
+    if total < 1e-6:
+        return 0.0
+    ax, ay, bx, by = ax / total, ay / total, bx / total, by / total
+    dot, cross = 0.0, 0.0
+    for i in range(source.shape[0]):
+        sx, sy = source[i, 0] - ax, source[i, 1] - ay
+        for e in range(first[i], first[i + 1]):
+            qx, qy = target[partner[e], 0] - bx, target[partner[e], 1] - by
+            dot += probability[e] * (sx * qx + sy * qy)
+            cross += probability[e] * (sx * qy - sy * qx)
+    theta = math.atan2(cross, dot) if dot != 0.0 or cross != 0.0 else state[0]
+    cos, sin = math.cos(theta), math.sin(theta)
+    x, y = bx - (cos * ax - sin * ay), by - (sin * ax + cos * ay)
+    square = 0.0
+    for i in range(source.shape[0]):
+        px = cos * source[i, 0] - sin * source[i, 1] + x
+        py = sin * source[i, 0] + cos * source[i, 1] + y
+        for e in range(first[i], first[i + 1]):
+            ex, ey = target[partner[e], 0] - px, target[partner[e], 1] - py
+            square += probability[e] * (ex * ex + ey * ey)
+    sigma = min(max(math.sqrt(square / (2.0 * total)), min_sigma), max_sigma)
+    moved = abs(theta - state[0]) + (abs(x - state[1]) + abs(y - state[2])) / max_sigma
+    moved += abs(math.log(sigma / state[3]))
+    most = 0.98 * min(source.shape[0], target.shape[0])
+    state[0], state[1], state[2], state[3] = theta, x, y, sigma
+    state[4] = min(max(total, min(0.5, most)), most)
+    return moved
 
 
 @njit(cache=True, nogil=True)
 def expectation_maximisation(
     source, source_weights, target, target_weights, area, min_sigma, max_sigma, state, max_steps,
-    tolerance, information,
+    tolerance, max_sweeps, information,
 ):  # fmt: skip
-    """Iterate ``state`` (theta, x, y, sigma, share) in place; returns the log-likelihood ratio."""
-    m = source.shape[0]
-    partner = np.empty((m, 6))
-    weight_sum = source_weights.sum()
-    value = _expect(source, source_weights, target, target_weights, area, state, partner)
-    for _ in range(max_steps):
-        total, ax, ay, bx, by = 0.0, 0.0, 0.0, 0.0, 0.0
+    """Iterate ``state`` in place; returns the log-likelihood ratio to "nothing belongs together".
+
+    The weights scale the activities of a point's pairs. ``information`` (3, 3) becomes the
+    negative second derivatives in theta, x, y, with the pairs uncertain.
+    """
+    m, n = source.shape[0], target.shape[0]
+    first = np.zeros(m + 1, np.int64)
+    room = 16 * m
+    partner = np.empty(room, np.int64)
+    dx, dy, activity = np.empty(room), np.empty(room), np.empty(room)
+    probability, free = np.empty(room), np.empty(room)
+    load = np.zeros(n)
+    step = 0
+    while True:
+        sigma, num_pairs = state[3], state[4]
+        count = _near_pairs(source, target, state, _CUT * sigma, first, partner, dx, dy)
+        while count < 0:
+            room *= 2
+            partner = np.empty(room, np.int64)
+            dx, dy, activity = np.empty(room), np.empty(room), np.empty(room)
+            probability, free = np.empty(room), np.empty(room)
+            count = _near_pairs(source, target, state, _CUT * sigma, first, partner, dx, dy)
+        # The number of pairs that makes itself the likeliest, by Stirling's formula.
+        odds = num_pairs / ((m - num_pairs) * (n - num_pairs))
+        peak = odds * area / (2.0 * math.pi * sigma * sigma)
+        scale = -0.5 / (sigma * sigma)
         for i in range(m):
-            w = partner[i, 0]
-            if w > 0.0:
-                total += w
-                ax += w * source[i, 0]
-                ay += w * source[i, 1]
-                bx += w * partner[i, 1]
-                by += w * partner[i, 2]
-        if total < 1e-9:
+            for e in range(first[i], first[i + 1]):
+                weight = source_weights[i] * target_weights[partner[e]]
+                square = dx[e] * dx[e] + dy[e] * dy[e]
+                activity[e] = peak * weight * math.exp(scale * square)
+        value = _couple(first, partner, activity, count, probability, free, load, max_sweeps)
+        value -= num_pairs * math.log(odds) + _log_choices(m, n, num_pairs)
+        if step >= max_steps:
             break
-        ax, ay, bx, by = ax / total, ay / total, bx / total, by / total
-        dot, cross = 0.0, 0.0
-        for i in range(m):
-            w = partner[i, 0]
-            if w > 0.0:
-                sx, sy = source[i, 0] - ax, source[i, 1] - ay
-                qx, qy = partner[i, 1] - bx, partner[i, 2] - by
-                dot += w * (sx * qx + sy * qy)
-                cross += w * (sx * qy - sy * qx)
-        theta = math.atan2(cross, dot) if dot != 0.0 or cross != 0.0 else state[0]
-        cos, sin = math.cos(theta), math.sin(theta)
-        x, y = bx - (cos * ax - sin * ay), by - (sin * ax + cos * ay)
-        # The spread about the new pose: spread about the old one, corrected by the partners'
-        # means.
-        square = 0.0
-        for i in range(m):
-            w = partner[i, 0]
-            if w > 0.0:
-                ox, oy = partner[i, 1] - partner[i, 4], partner[i, 2] - partner[i, 5]
-                nx = partner[i, 1] - (cos * source[i, 0] - sin * source[i, 1] + x)
-                ny = partner[i, 2] - (sin * source[i, 0] + cos * source[i, 1] + y)
-                square += partner[i, 3] - w * (ox * ox + oy * oy) + w * (nx * nx + ny * ny)
-        sigma = math.sqrt(max(square, 0.0) / (2.0 * total))
-        moved = abs(theta - state[0]) + (abs(x - state[1]) + abs(y - state[2])) / max_sigma
-        moved += abs(math.log(max(sigma, min_sigma) / state[3]))
-        state[0], state[1], state[2] = theta, x, y
-        state[3] = min(max(sigma, min_sigma), max_sigma)
-        state[4] = min(max(total / weight_sum, 1e-3), 0.98)
-        value = _expect(source, source_weights, target, target_weights, area, state, partner)
+        step += 1
+        moved = _improve(source, target, first, partner, probability, min_sigma, max_sigma, state)
         if moved < tolerance:
-            break
-    _observe(source, source_weights, target, target_weights, area, state, information)
+            step = max_steps  # once more, for value and information at the last state
+    _observe(source, first, dx, dy, probability, state, information)
     return value
 
 
 @njit(cache=True, nogil=True)
-def _observe(source, source_weights, target, target_weights, area, state, information):
-    """Negative second derivatives of the likelihood in theta, x, y; partners are not certain."""
-    theta, tx, ty, sigma, share = state[0], state[1], state[2], state[3], state[4]
-    cos, sin = math.cos(theta), math.sin(theta)
-    cut = 4.5 * sigma
-    density = share * area / (target.shape[0] * 2.0 * math.pi * sigma * sigma)
-    scale = 1.0 / (sigma * sigma)
+def _observe(source, first, dx, dy, probability, state, information):
+    """Information on theta, x, y: that of the pairs, less what is unknown about who is paired."""
+    cos, sin = math.cos(state[0]), math.sin(state[0])
+    scale = 1.0 / (state[3] * state[3])
     information[:, :] = 0.0
     for i in range(source.shape[0]):
         rx = cos * source[i, 0] - sin * source[i, 1]
         ry = sin * source[i, 0] + cos * source[i, 1]
-        px, py = rx + tx, ry + ty
         total, mean_x, mean_y, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for j in range(_first_at_least(target, px - cut), target.shape[0]):
-            dx = target[j, 0] - px
-            if dx > cut:
-                break
-            dy = target[j, 1] - py
-            if dy > cut or dy < -cut:
-                continue
-            weight = target_weights[j] * math.exp(-0.5 * scale * (dx * dx + dy * dy))
-            total += weight
-            mean_x += weight * dx
-            mean_y += weight * dy
-            xx += weight * dx * dx
-            xy += weight * dx * dy
-            yy += weight * dy * dy
-        part = density / (1.0 - share + density * total) * scale
-        gx, gy = part * mean_x, part * mean_y
-        w = source_weights[i]
-        hxx = -w * (part * (xx * scale - total) - gx * gx)
-        hyy = -w * (part * (yy * scale - total) - gy * gy)
-        hxy = -w * (part * xy * scale - gx * gy)
+        for e in range(first[i], first[i + 1]):
+            p = probability[e]
+            total += p
+            mean_x += p * dx[e]
+            mean_y += p * dy[e]
+            xx += p * dx[e] * dx[e]
+            xy += p * dx[e] * dy[e]
+            yy += p * dy[e] * dy[e]
+        gx, gy = scale * mean_x, scale * mean_y
+        hxx = scale * total - scale * scale * xx + gx * gx
+        hyy = scale * total - scale * scale * yy + gy * gy
+        hxy = -scale * scale * xy + gx * gy
         information[0, 0] += (
-            ry * ry * hxx - 2.0 * rx * ry * hxy + rx * rx * hyy + w * (gx * rx + gy * ry)
+            ry * ry * hxx - 2.0 * rx * ry * hxy + rx * rx * hyy + gx * rx + gy * ry
         )
         information[0, 1] += -ry * hxx + rx * hxy
         information[0, 2] += -ry * hxy + rx * hyy
