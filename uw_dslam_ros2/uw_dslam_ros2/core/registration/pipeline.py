@@ -25,10 +25,10 @@ from uw_dslam_ros2.core.registration.branch_and_bound import (
     search,
 )
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
-from uw_dslam_ros2.core.registration.point_evidence import EvidenceModel, Outline
 from uw_dslam_ros2.core.registration.field import likelihood_field, mixture_field
 from uw_dslam_ros2.core.registration.lattice_scan import lattice_maxima
 from uw_dslam_ros2.core.registration.nnde import nnde_inliers
+from uw_dslam_ros2.core.registration.point_evidence import EvidenceModel, Outline
 from uw_dslam_ros2.core.registration.point_input import Cloud, Pair, cloud_of
 from uw_dslam_ros2.core.registration.point_output import Candidate, Rung, packed, too_few
 from uw_dslam_ros2.core.registration.point_verdict import posterior

@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.registration.point_evidence import Outline
 from uw_dslam_ros2.core.registration.lattice_scan import add_shifted, likelihood_raster
+from uw_dslam_ros2.core.registration.point_evidence import Outline
 
 __all__ = ["design_effect"]
 
