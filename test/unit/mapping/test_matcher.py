@@ -56,6 +56,20 @@ def test_a_straight_wall_is_not_believed_along_itself():
     assert along @ planar @ along < 5e-3 * (normal @ planar @ normal)
 
 
+def test_a_single_match_is_not_surer_than_it_is_good():
+    # Against a map without errors one match is much better than it says: a map that is built from
+    # matches repeats its errors, and the share of independent information allows for that.
+    squares = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        known = corner() + rng.normal(0, 0.03, corner().shape)
+        source = corner() + rng.normal(0, 0.03, corner().shape)
+        found = match(known, source)
+        error = found.T_target_source.as_array()
+        squares.append(error @ found.information @ error / 3.0)
+    assert np.mean(squares) < 1.0
+
+
 def test_information_grows_with_the_number_of_echoes():
     few = match(corner(), corner()[::4])
     many = match(corner(), corner())

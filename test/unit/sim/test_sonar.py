@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
+from uw_dslam_ros2.cli.studies.sonar import speckle_statistics
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.clutter import Scatterers
 from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
@@ -197,25 +197,6 @@ def test_speckle_is_fully_developed():
     assert (deviation**3).mean() / deviation.std() ** 3 == pytest.approx(-0.087, abs=0.1)
 
 
-def statistics(pings):
-    """Coefficient of variation, skewness, correlation of next beams and next ranges."""
-    x = np.asarray(pings, dtype=float)
-    local = np.stack([gaussian_filter(p, 6.0) for p in x])
-    y = (x / local - 1.0)[:, 20:-20, 20:-20]
-
-    def correlation(a, b):
-        return (a * b).mean() / math.sqrt((a * a).mean() * (b * b).mean())
-
-    return np.array(
-        [
-            y.std(),
-            (y**3).mean() / y.std() ** 3,
-            correlation(y[:, :, 1:], y[:, :, :-1]),
-            correlation(y[:, 1:], y[:, :-1]),
-        ]
-    )
-
-
 @pytest.mark.data
 @pytest.mark.skipif(
     not os.environ.get("UW_DATA_DIR"), reason="UW_DATA_DIR is not set: no real Oculus pings"
@@ -223,7 +204,7 @@ def statistics(pings):
 def test_speckle_is_that_of_a_real_sonar():
     data = np.load(Path(os.environ["UW_DATA_DIR"]) / "oculus" / "pings.npz")
     # The far half shows little but an even seabed.
-    real = statistics(data["image"][:, 520:700, 20:236])
+    real = speckle_statistics(data["image"][:, 520:700, 20:236])
     config = SonarConfig(
         fov_rad=math.radians(60.0),
         num_beams=256,
@@ -239,5 +220,5 @@ def test_speckle_is_that_of_a_real_sonar():
     sonar = simulator(config=config)
     rng = np.random.default_rng(0)
     pings = [sonar.ping(0, SE2(yaw=1.5), 1.0, rng).intensity[520:700, 20:236] for _ in range(3)]
-    ours = statistics(pings)
+    ours = speckle_statistics(np.array(pings))
     assert (np.abs(ours - real) < [0.03, 0.25, 0.12, 0.1]).all(), (ours, real)
