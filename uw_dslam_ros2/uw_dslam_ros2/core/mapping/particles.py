@@ -11,6 +11,7 @@ from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.covariances import rotated_covariance
 from uw_dslam_ros2.core.mapping.loops import with_bend
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
+from uw_dslam_ros2.core.mapping.occupancy import SparseEvidence
 from uw_dslam_ros2.core.mapping.rivals import conflict
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.se2 import SE2
@@ -99,13 +100,14 @@ class ParticleFilter:
         targets = self._candidates(sections)
         num_matched = 0
         if targets:
+            grids = {i: sections[i].evidence.unpacked() for i in [*targets, len(sections) - 1]}
             known: dict[bytes, tuple[FloatArray, FloatArray, float] | None] = {}
             for i in range(count):
                 seen = self._relative(i, targets)
                 # Particles of one ancestor have the same map here.
                 key = seen.tobytes()
                 if key not in known:
-                    known[key] = self._improved(sections, targets, seen, step, covariance)
+                    known[key] = self._improved(sections, grids, targets, seen, step, covariance)
                 found = known[key]
                 if found is not None:
                     means[i], covariances[i] = found[0], found[1]
@@ -149,6 +151,7 @@ class ParticleFilter:
     def _improved(
         self,
         sections: list[ClosedSection],
+        grids: dict[int, SparseEvidence],
         targets: list[int],
         seen: FloatArray,
         step: SE2,
@@ -182,8 +185,9 @@ class ParticleFilter:
         against = 0.0
         for pose, index in pairs:
             T_target_source = pose.inverse() @ match.T_target_source
-            there = conflict(sections[index].evidence, newest.points, T_target_source)
-            back = conflict(newest.evidence, sections[index].points, T_target_source.inverse())
+            there = conflict(grids[index], newest.points, T_target_source)
+            mine, theirs = grids[len(sections) - 1], sections[index].points
+            back = conflict(mine, theirs, T_target_source.inverse())
             against = max(against, there, back)
         if against > config.loop.max_conflict:
             return None

@@ -23,11 +23,17 @@ _LEAST_SHARE = 0.5
 _SLACK = 0.08
 
 
-def conflict(evidence: PackedEvidence, points: FloatArray, T_grid_points: SE2) -> float:
-    """Share of the points (N, 2) that fall on surely free water of a grid."""
+def conflict(
+    evidence: PackedEvidence | SparseEvidence, points: FloatArray, T_grid_points: SE2
+) -> float:
+    """Share of the points (N, 2) that fall on surely free water of a grid.
+
+    Who asks often unpacks the grid first.
+    """
     if len(points) == 0:
         return 0.0
-    return float(_on_water(evidence.unpacked(), points, T_grid_points).sum()) / len(points)
+    grid = evidence.unpacked() if isinstance(evidence, PackedEvidence) else evidence
+    return float(_on_water(grid, points, T_grid_points).sum()) / len(points)
 
 
 def has_rival(
