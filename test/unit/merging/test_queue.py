@@ -11,6 +11,8 @@ from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, SubmapState
+from uw_dslam_ros2.core.merging.graph import Edge
+from uw_dslam_ros2.core.merging.settling import Joint, loop_errors
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, lawnmower_fleet, refuse
@@ -333,3 +335,73 @@ def test_answers_that_are_not_sure_enough_alone_join_where_they_all_agree():
     answer_all(queue, unsure)
     assert {r.component for r in queue.submaps()} == {0}
     assert FLEET.position_rmse_m(queue) < 0.2
+    registrations = [c for c in queue.constraints() if c.kind is ConstraintKind.REGISTRATION]
+    assert registrations
+    assert all(c.is_unsure for c in registrations)
+    reasons = {r.reason for r in queue.submaps() if r.submap.vehicle_id == "auv_2"}
+    assert all("unsure alone" in reason for reason in reasons)
+
+
+def test_only_edges_of_refused_answers_are_marked_unsure():
+    def half_sure(request):
+        answer = KnowingMatcher(FLEET)(request)
+        if request.prior is None or not answer.is_accepted:
+            return answer
+        return dataclasses.replace(answer, verdict=Verdict.NOT_ENOUGH_OVERLAP, probability=0.7)
+
+    queue = filled()
+    answer_all(queue, half_sure)
+    refused = {
+        frozenset((answer.match.source.reference[0], answer.match.target.reference[0]))
+        for answer, is_used in queue.answers()
+        if is_used and not answer.is_accepted
+    }
+    marked = [c for c in queue.constraints() if c.is_unsure]
+    assert refused
+    assert {frozenset((c.source[0], c.target[0])) for c in marked} == refused
+    assert len(marked) == sum(u and not a.is_accepted for a, u in queue.answers())
+
+
+def test_what_a_false_edge_had_merged_leaves_nothing_behind():
+    """The map after it fell out is, byte for byte, one in which it never was believed."""
+    fleet = lawnmower_fleet(4, 1, 3, lane_m=5.0)
+    ids = sorted(fleet.submaps)
+
+    def matcher(request):
+        share = float({*request.source_ids, *request.target_ids} == {ids[0], ids[1]})
+        return KnowingMatcher(fleet, wrong_share=share)(request)
+
+    grown = filled(ids[:2], fleet=fleet)
+    answer_all(grown, matcher)
+    false_spec = grown.global_map().spec
+    for submap_id in ids[2:]:
+        grown.add_submap(fleet.submaps[submap_id])
+    answer_all(grown, matcher)
+    whole = filled(fleet=fleet)
+    answer_all(whole, matcher)
+    assert map_bytes(grown) == map_bytes(whole)
+    assert grown.global_map().spec != false_spec
+    assert fleet.position_rmse_m(grown) < 0.5
+
+
+def test_loops_are_measured_in_metres_and_radians():
+    """A cycle with one edge that is off by a known amount fails to close by that amount."""
+    exact = np.diag([1e-4, 1e-4, 1e-6])
+    odometry = [Edge(("a", 1), ("a", 0), SE2(4.0, 0.0, 0.5), exact)]
+    joints = [
+        Joint((b"1", b"", ()), Edge(("b", 0), ("a", 0), SE2(1.0, 2.0, 0.3), exact), 0.99),
+        Joint(
+            (b"2", b"", ()),
+            Edge(
+                ("b", 0),
+                ("a", 1),
+                SE2(4.0, 0.0, 0.5).inverse() @ SE2(1.0, 2.0, 0.3) @ SE2(0.3, 0.4, 0.1),
+                exact,
+            ),
+            0.9,
+        ),
+    ]
+    (loop,) = loop_errors(odometry, joints)
+    assert set(loop.submaps) == {("a", 0), ("a", 1), ("b", 0)}
+    assert loop.error_rad == pytest.approx(0.1)
+    assert loop.error_m == pytest.approx(0.5, abs=0.15)

@@ -191,6 +191,10 @@ class MapQueueManager(Node):
             self._ask_again(request_id, reason)
         self._queue.is_growing = self._arrivals.is_growing(now_s)
         self._ask()
+        # First saved, then told: what anybody has heard of outlives a kill.
+        if not self._is_saved and self._config.session:
+            save_session(self._config.session, self._queue)
+            self._is_saved = True
         if self._is_changed and now_s - self._published_s >= self._config.publish_period_s:
             self._is_changed = False
             self._published_s = now_s
@@ -200,9 +204,6 @@ class MapQueueManager(Node):
             self._publish_status()
         self._map.publish_overdue(self._now())
         self._publish_transforms()
-        if not self._is_saved and self._config.session:
-            save_session(self._config.session, self._queue)
-            self._is_saved = True
 
     def _discover(self) -> None:
         self._servers.discover()

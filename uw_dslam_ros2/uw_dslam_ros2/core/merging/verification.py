@@ -232,7 +232,8 @@ def _prior_around(guess: SE2, half_width_m: float, half_width_rad: float) -> Pri
         power = math.ceil(math.log(wanted) / math.log(_PRIOR_RATIO) - 1e-9)
         widths.append(_PRIOR_RATIO**power)
     steps = np.array([widths[0], widths[0], widths[1]]) * _PRIOR_STEP
-    middle = np.round(steps * np.round(guess.as_array() / steps), 6)
+    # Adding nothing turns -0.0, which is the same but reads differently, into 0.0.
+    middle = np.round(steps * np.round(guess.as_array() / steps), 6) + 0.0
     return PriorWindow(
         SE2.from_array(middle), round(widths[0], 3), round(min(widths[1], math.pi), 4)
     )
