@@ -206,13 +206,13 @@ def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure |
     tolerance_cells = 0.25 / spec.resolution_m
     near_true = _near(true > 50, tolerance_cells)
     near_found = _near(found > 50, tolerance_cells)
-    picture = np.empty((*spec.shape, 3))
-    picture[:] = _UNKNOWN
-    picture[(found >= 0) | (true >= 0)] = _SEEN
-    picture[found >= 0] = _FREE
-    picture[(true > 50) & ~near_found] = _MISSING
-    picture[(found > 50) & near_true] = _AGREE
-    picture[(found > 50) & ~near_true] = _EXTRA
+    picture = np.empty((*spec.shape, 3), dtype=np.uint8)
+    picture[:] = _byte(_UNKNOWN)
+    picture[(found >= 0) | (true >= 0)] = _byte(_SEEN)
+    picture[found >= 0] = _byte(_FREE)
+    picture[(true > 50) & ~near_found] = _byte(_MISSING)
+    picture[(found > 50) & near_true] = _byte(_AGREE)
+    picture[(found > 50) & ~near_true] = _byte(_EXTRA)
     figure, axes = _single(spec)
     _show_picture(axes, picture, spec)
     _scale_bar(axes)
@@ -260,16 +260,16 @@ def overlay(
     """Lay a source map on a target map: their walls in two colours, and where both agree."""
     spec = _common_spec(target, source, T_target_source)
     found, true = resample(source, spec, T_target_source), resample(target, spec)
-    picture = np.empty((*spec.shape, 3))
-    picture[:] = _UNKNOWN
-    picture[(found >= 0) ^ (true >= 0)] = _SEEN
-    picture[(found >= 0) & (true >= 0)] = _FREE
+    picture = np.empty((*spec.shape, 3), dtype=np.uint8)
+    picture[:] = _byte(_UNKNOWN)
+    picture[(found >= 0) ^ (true >= 0)] = _byte(_SEEN)
+    picture[(found >= 0) & (true >= 0)] = _byte(_FREE)
     tolerance_cells = 2.0
     both = (true > 50) & _near(found > 50, tolerance_cells)
     both |= (found > 50) & _near(true > 50, tolerance_cells)
-    picture[true > 50] = _MISSING
-    picture[found > 50] = _EXTRA
-    picture[both] = _AGREE
+    picture[true > 50] = _byte(_MISSING)
+    picture[found > 50] = _byte(_EXTRA)
+    picture[both] = _byte(_AGREE)
     figure, axes = _single(spec)
     _show_picture(axes, picture, spec)
     _scale_bar(axes)
@@ -336,27 +336,25 @@ def _extent_m(occupancy: OccupancyMap) -> tuple[float, float]:
 
 def _show_map(axes: Axes, occupancy: OccupancyMap) -> None:
     values = occupancy.values
-    picture = np.empty((*values.shape, 3))
-    picture[:] = _UNKNOWN
     # Between free and wall the shade follows the probability.
-    share = np.clip(values, FREE, OCCUPIED)[..., None] / 100.0
-    known = values != UNKNOWN
-    shade = (1.0 - share) * _FREE + share * _WALL
-    picture[known] = shade[known]
-    _show_picture(axes, picture, occupancy.spec, *_cropped(occupancy))
+    share = np.linspace(0.0, 1.0, OCCUPIED - FREE + 1)[:, None]
+    shades = (1.0 - share) * np.array(_FREE) + share * np.array(_WALL)
+    table = np.rint(255.0 * np.vstack([_UNKNOWN, shades])).astype(np.uint8)
+    low, high = _cropped(occupancy)
+    picture = table[values[low[0] : high[0], low[1] : high[1]] - UNKNOWN]
+    _show_picture(axes, picture, occupancy.spec, low, high)
 
 
 def _show_picture(
     axes: Axes,
-    picture: FloatArray,
+    picture: NDArray[np.uint8],
     spec: GridSpec,
     low: NDArray[np.int64] | None = None,
     high: NDArray[np.int64] | None = None,
 ) -> None:
-    """Show cells, or those from `low` to `high`, as they lie; thin walls survive the reduction."""
+    """Show a picture of the cells from `low` to `high` as they lie; thin walls stay visible."""
     low = np.zeros(2, np.int64) if low is None else low
     high = np.array(spec.shape) if high is None else high
-    picture = picture[low[0] : high[0], low[1] : high[1]]
     factor = max(1, math.ceil(max(picture.shape[:2]) / _MAX_PIXELS))
     picture = _darkest(picture, factor)
     resolution = spec.resolution_m
@@ -385,17 +383,21 @@ def _show_picture(
         spine.set_color("#c4cad0")
 
 
-def _darkest(picture: FloatArray, factor: int) -> FloatArray:
+def _byte(color: tuple[float, float, float]) -> NDArray[np.uint8]:
+    return np.rint(255.0 * np.array(color)).astype(np.uint8)
+
+
+def _darkest(picture: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """Reduce by a whole factor; of each block the darkest cell stays."""
     if factor == 1:
         return picture
     rows, cols = (math.ceil(n / factor) * factor for n in picture.shape[:2])
-    padded = np.empty((rows, cols, 3))
-    padded[:] = _UNKNOWN
+    padded = np.empty((rows, cols, 3), dtype=np.uint8)
+    padded[:] = _byte(_UNKNOWN)
     padded[: picture.shape[0], : picture.shape[1]] = picture
     blocks = padded.reshape(rows // factor, factor, cols // factor, factor, 3).swapaxes(1, 2)
     blocks = blocks.reshape(rows // factor, cols // factor, factor * factor, 3)
-    index = blocks.sum(axis=-1).argmin(axis=-1)
+    index = blocks.sum(axis=-1, dtype=np.uint16).argmin(axis=-1)
     return np.take_along_axis(blocks, index[..., None, None], axis=2)[:, :, 0]
 
 
