@@ -164,7 +164,8 @@ class _Match:
             rungs, candidates = self._likelihood()
         else:
             rungs, candidates = self._gmrbnb()
-        candidates = [self._polished(candidates[0]), *candidates[1:]]
+        candidates = self._best_first(candidates)
+        candidates[0] = self._polished(candidates[0])
         return packed(
             self._pair, rungs[0], candidates, self._config,
             spacing_m=self._spacing_m,
@@ -173,6 +174,19 @@ class _Match:
             num_boxes=sum(rung.outcome.num_boxes for rung in rungs),
             seconds=self._clock() - start if self._clock else math.nan,
         )  # fmt: skip
+
+    def _best_first(self, candidates: list[Candidate]) -> list[Candidate]:
+        """The pose to report in front.
+
+        Where points repeat each other, how much is only known roughly: enough to judge one pose
+        with the full amount, which is the careful side, but between poses the geometric mean of
+        all and nothing is in error least.
+        """
+        repetition = math.sqrt(self._evidence.repetition)
+        if repetition == 1.0:
+            return candidates
+        best = max(candidates, key=lambda pair: self._evidence.of(pair[1], repetition))
+        return [best, *(pair for pair in candidates if pair is not best)]
 
     def _likelihood(self) -> tuple[list[Rung], list[Candidate]]:
         """Searches and all candidates, until these are decisive."""

@@ -87,22 +87,23 @@ class EvidenceModel:
     has_prior: bool  # a window was given: where in it says nothing about overlap
     repetition: float = 1.0  # points that say the same thing together: 1 where all are independent
 
-    def of(self, refinement: Refinement) -> float:
+    def of(self, refinement: Refinement, repetition: float | None = None) -> float:
         """Log of the Bayes factor of "the sets have this pose" against chance [nats].
 
         Likelihood ratio, times the prior's share of the peak in pose (Laplace's method), noise and
         number of pairs. A peak wider than a fifth of the spacing is counted as that wide: it is
-        not one pose.
+        not one pose. `repetition` other than the model's own is for comparing poses only.
         """
         scale = np.array([self.arm_m, 1.0, 1.0])
         curvature = np.linalg.eigvalsh(refinement.information / np.outer(scale, scale))
-        curvature = curvature / self.repetition
+        repetition = self.repetition if repetition is None else repetition
+        curvature = curvature / repetition
         if curvature[0] <= 1e-12 * curvature[-1]:
             return -math.inf
         widths = np.minimum(1.0 / np.sqrt(curvature), _RESOLVED * self.spacing_m)
         log_peak = float(np.log(widths).sum()) + 1.5 * math.log(2.0 * math.pi)
         log_pose = min(log_peak - math.log(self.volume * self.arm_m), 0.0)
-        value = refinement.log_likelihood / self.repetition + log_pose + self._log_fit(refinement)
+        value = refinement.log_likelihood / repetition + log_pose + self._log_fit(refinement)
         return value if self.has_prior else value + self.log_overlap(refinement.pose())
 
     def _log_fit(self, refinement: Refinement) -> float:
