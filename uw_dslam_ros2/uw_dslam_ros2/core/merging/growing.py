@@ -27,7 +27,7 @@ from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.library import Library
-from uw_dslam_ros2.core.merging.plan import Plan, component_numbers
+from uw_dslam_ros2.core.merging.plan import Plan, component_numbers, most_promising
 from uw_dslam_ros2.core.merging.settling import Component, Joint
 from uw_dslam_ros2.core.merging.verification import Verifier, is_worth_checking
 
@@ -86,7 +86,7 @@ class _GrowingPlanner:
         return self._library.settle(self._anchor, unique, self._config.inlier_probability)
 
     def _apart(self, components: Sequence[Component]) -> list[Pair]:
-        """Pairs of vehicles of different components, the most promising first."""
+        """The best pairs of vehicles of different components, the most promising first."""
         where = component_numbers(components)
         number = {v: where[self._library.closed(v)[0]] for v in self._library.vehicles}
         pairs = [
@@ -97,7 +97,8 @@ class _GrowingPlanner:
         if len(pairs) < 2:
             return pairs
         shapes = {v: self._library.rough_shape(v) for pair in pairs for v in pair}
-        return sorted(pairs, key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
+        pairs.sort(key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
+        return most_promising(pairs, self._config.max_partners)
 
     def _check_claims(self, pair: Pair) -> list[Joint]:
         """Joints of earlier answers that may be right, the one of the largest maps first."""

@@ -36,7 +36,7 @@ from uw_dslam_ros2.core.merging.settling import Component, Joint
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.merging.verification import Verifier
 
-__all__ = ["Plan", "component_numbers", "make_plan"]
+__all__ = ["Plan", "component_numbers", "make_plan", "most_promising"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +94,7 @@ class _Planner:
 
     def run(self) -> Plan:
         ranked = self._ranked(self._units)
-        first = [pair for pair in ranked if pair in self._partners(ranked)]
+        first = most_promising(ranked, self._config.max_partners)
         joints = self._match_vehicles(first)
         if not self._is_waiting():
             apart = self._apart(joints, [pair for pair in ranked if pair not in set(first)])
@@ -120,17 +120,6 @@ class _Planner:
         shapes = {vehicle: self._library.shape(unit) for vehicle, unit in units.items()}
         pairs = itertools.combinations(sorted(units), 2)
         return sorted(pairs, key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
-
-    def _partners(self, ranked: Sequence[tuple[str, str]]) -> set[tuple[str, str]]:
-        """Pairs that are among the best few of either vehicle."""
-        count: dict[str, int] = {}
-        chosen: set[tuple[str, str]] = set()
-        for pair in ranked:
-            if min(count.get(vehicle, 0) for vehicle in pair) < self._config.max_partners:
-                chosen.add(pair)
-                for vehicle in pair:
-                    count[vehicle] = count.get(vehicle, 0) + 1
-        return chosen
 
     def _match_vehicles(self, pairs: Iterable[tuple[str, str]]) -> list[Joint]:
         joints: list[Joint] = []
@@ -256,6 +245,18 @@ class _Planner:
         # One answer may serve several matches; it is one edge.
         unique = list({joint.key: joint for joint in joints}.values())
         return self._library.settle(self._anchor, unique, self._config.inlier_probability)
+
+
+def most_promising(ranked: Sequence[tuple[str, str]], max_partners: int) -> list[tuple[str, str]]:
+    """Of ranked pairs, those that are among the best few of either vehicle."""
+    count: dict[str, int] = {}
+    chosen: list[tuple[str, str]] = []
+    for pair in ranked:
+        if min(count.get(vehicle, 0) for vehicle in pair) < max_partners:
+            chosen.append(pair)
+            for vehicle in pair:
+                count[vehicle] = count.get(vehicle, 0) + 1
+    return chosen
 
 
 def component_numbers(components: Sequence[Component]) -> dict[SubmapId, int]:
