@@ -14,21 +14,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.sim.buildings import draw_cellular, draw_corridors, draw_hall, draw_oblique
 
-__all__ = ["PLACE_KINDS", "make_place"]
+__all__ = ["BASIN_MARGIN", "PLACE_KINDS", "make_place"]
 
 BoolGrid = NDArray[np.bool_]
-PLACE_KINDS = ("office", "harbour", "lake", "cave", "symmetric")
+PLACE_KINDS = (
+    "office",
+    "corridors",
+    "oblique",
+    "hall",
+    "cellular",
+    "harbour",
+    "lake",
+    "cave",
+    "symmetric",
+    "basin",
+)
+BASIN_MARGIN = 0.1
+"""Land to either end of a basin, share of the place's side."""
 
 
 def make_place(kind: str, size_cells: int, rng: np.random.Generator) -> BoolGrid:
     """Solid cells (size_cells, size_cells) of a random place; ``kind`` is one of `PLACE_KINDS`."""
     makers = {
         "office": _office,
+        "corridors": draw_corridors,
+        "oblique": draw_oblique,
+        "hall": draw_hall,
+        "cellular": draw_cellular,
         "harbour": _harbour,
         "lake": _lake,
         "cave": _cave,
         "symmetric": _symmetric,
+        "basin": _basin,
     }
     if kind not in makers:
         raise InvalidInputError(f"kind is {kind!r}, expected one of {', '.join(PLACE_KINDS)}")
@@ -205,3 +224,29 @@ def _symmetric(size: int, rng: np.random.Generator) -> NDArray[np.uint8]:
     image = half.copy()
     image[size - size // 2 :] = np.rot90(half, 2)[size - size // 2 :]
     return image
+
+
+def _basin(size: int, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A plain basin along x with a few piers, the same after a half turn."""
+    image = np.ones((size, size), np.uint8)
+    margin = int(BASIN_MARGIN * size)
+    width = int(size * rng.uniform(0.2, 0.5))
+    top = (size - width) // 2
+    image[top : top + width, margin : size - margin] = 0
+    corner = int(rng.choice([0, 0, width // 6, width // 2 - 1]))
+    if corner:
+        image[top : top + width, margin : margin + corner] = 1
+        center = (margin + corner, top + width // 2)
+        axes = (corner, width // 2)
+        if rng.random() < 0.5:
+            cv2.ellipse(image, center, axes, 0.0, 90.0, 270.0, 0, -1)
+        else:
+            corners = [(center[0], top), (margin, center[1]), (center[0], top + width)]
+            cv2.fillPoly(image, [np.array(corners, np.int32)], 0)
+    for _ in range(int(rng.integers(0, 4))):
+        x, length = int(rng.uniform(margin, size // 2)), int(width * rng.uniform(0.1, 0.4))
+        start = top if rng.random() < 0.5 else top + width - length
+        image[start : start + length, x : x + int(rng.integers(4, 20))] = 1
+    whole = image.copy()
+    whole[:, size - size // 2 :] = np.rot90(image, 2)[:, size - size // 2 :]
+    return whole

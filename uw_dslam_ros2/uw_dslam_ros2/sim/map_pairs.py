@@ -7,7 +7,7 @@ by any angle, and damaged.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.floor_plans import make_place
+from uw_dslam_ros2.sim.floor_plans import BASIN_MARGIN, make_place
 
 __all__ = ["NOISES", "MapNoise", "MapPair", "cut_pair", "damage", "make_pair", "observe"]
 
 Values = NDArray[np.int8]
+_BEND_CELLS = 300
+_BUILDINGS = ("corridors", "oblique", "hall", "cellular")
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +138,13 @@ def damage(values: Values, noise: MapNoise, rng: np.random.Generator) -> Values:
 def _bend(values: Values, bend_cells: float, rng: np.random.Generator) -> Values:
     shape = values.shape
     rows, cols = np.indices(shape, dtype=np.float32)
+    step = -(-max(shape) // _BEND_CELLS)  # so smooth a field needs no more
+    small = tuple(-(-size // step) for size in shape)
     shifts = []
     for _ in range(2):
-        field = rng.standard_normal(shape).astype(np.float32)
-        field = cv2.GaussianBlur(field, (0, 0), max(shape) / 5.0, borderType=cv2.BORDER_REFLECT)
+        field = rng.standard_normal(small).astype(np.float32)
+        field = cv2.GaussianBlur(field, (0, 0), max(small) / 5.0, borderType=cv2.BORDER_REFLECT)
+        field = cv2.resize(field, shape[::-1], interpolation=cv2.INTER_LINEAR)
         field -= field.mean()
         shifts.append(field * np.float32(bend_cells / max(float(np.abs(field).max()), 1e-12)))
     limit = np.float32(math.sqrt(0.5))
@@ -207,12 +212,16 @@ def cut_pair(
     size_cells: int = 260,
     resolution_m: float = 0.05,
     is_matching: bool = True,
+    T_world_windows: tuple[SE2, SE2] | None = None,
 ) -> MapPair:
     """Cut windows out of two observations (R, R) of a place, damage them, give them own frames.
 
     With ``is_matching`` false the observations are of different places and the pair has no answer.
+    ``T_world_windows`` are the windows' poses in cells; at random, ``overlap`` apart, where None.
     """
-    T_world_a, T_world_b = _place_windows(values_a.shape[0], size_cells, overlap, rng)
+    T_world_a, T_world_b = T_world_windows or _place_windows(
+        values_a.shape[0], size_cells, overlap, rng
+    )
     maps, specs = [], []
     for values, T_world_window in ((values_a, T_world_a), (values_b, T_world_b)):
         window = damage(_cut(values, T_world_window, size_cells), NOISES[noise], rng)
@@ -242,31 +251,61 @@ def make_pair(
     resolution_m: float = 0.05,
     is_matching: bool = True,
     is_sonar: bool = False,
+    is_twin: bool = False,
 ) -> MapPair:
     """A pair of a generated place; same arguments, same pair.
 
     ``is_sonar`` observes the place twice, each time with few narrow looks and dropped beams, so
     that the maps have holes and see different things; otherwise both windows are cut from one good
-    map.
+    map. ``is_twin`` puts one window where the place, seen after a half turn, looks like what the
+    other window shows, so that the pair seems to match and does not (kind basin only).
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown kind or noise, or a twin of a place that has none.
     """
+    if noise not in NOISES:
+        raise InvalidInputError(f"noise is {noise!r}, expected one of {', '.join(NOISES)}")
+    if is_twin and kind != "basin":
+        raise InvalidInputError(f"kind is {kind!r}, expected basin: others have no twin")
     rng = np.random.default_rng((seed, sum(kind.encode()), size_cells))
     world_cells = int(size_cells * 2.4)
     solid = make_place(kind, world_cells, rng)
-    other = solid if is_matching else make_place(kind, world_cells, rng)
+    other = solid if is_matching or is_twin else make_place(kind, world_cells, rng)
     reach = size_cells * 0.9
     if is_sonar:
         looks = {"num_views": 90, "view_rad": math.radians(130.0), "dropout": 0.15}
         values_a = observe(solid, rng, range_cells=reach * 0.7, **looks)  # type: ignore[arg-type]
         values_b = observe(other, rng, range_cells=reach * 0.7, **looks)  # type: ignore[arg-type]
     else:
-        values_a = observe(solid, rng, range_cells=reach)
-        values_b = values_a if is_matching else observe(other, rng, range_cells=reach)
+        # A robot looks into some rooms only.
+        views = int(rng.integers(12, 60)) if kind in _BUILDINGS else 60
+        values_a = observe(solid, rng, range_cells=reach, num_views=views)
+        values_b = (
+            values_a if other is solid else observe(other, rng, range_cells=reach, num_views=views)
+        )
+    windows = None
+    if kind == "basin":
+        windows = _windows_at_an_end(world_cells, size_cells, overlap, rng)
+        if is_twin:
+            half_turn = SE2(float(world_cells), float(world_cells), math.pi)
+            windows = (windows[0], half_turn @ windows[1])
     pair = cut_pair(
         values_a, values_b, kind, overlap, noise, rng,
-        size_cells=size_cells, resolution_m=resolution_m, is_matching=is_matching,
+        size_cells=size_cells, resolution_m=resolution_m,
+        is_matching=is_matching and not is_twin, T_world_windows=windows,
     )  # fmt: skip
-    if kind != "symmetric":
-        return pair
-    return MapPair(
-        pair.kind, pair.noise, pair.overlap, pair.source, pair.target, pair.T_target_source, True
-    )
+    return replace(pair, is_ambiguous=kind in ("symmetric", "basin"))
+
+
+def _windows_at_an_end(
+    world_cells: int, size_cells: int, overlap: float, rng: np.random.Generator
+) -> tuple[SE2, SE2]:
+    """Poses of two windows about one end of a basin that lies along x, in cells."""
+    half = size_cells / 2.0
+    end = np.array([BASIN_MARGIN * world_cells + 0.35 * size_cells, 0.5 * world_cells])
+    first, heading = end + rng.normal(0.0, 0.08 * size_cells, 2), rng.uniform(-math.pi, math.pi)
+    step = size_cells * (1.0 - overlap) * np.array([math.cos(heading), math.sin(heading)])
+    yaws = rng.uniform(-math.pi, math.pi, 2)
+    return _window_at(first, yaws[0], half), _window_at(first + step, yaws[1], half)
