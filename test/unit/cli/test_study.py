@@ -113,3 +113,53 @@ def test_sigma_compares_fixed_kernels_with_the_ladder(tmp_path, capsys, monkeypa
         if row["is_paper"] == "1":
             assert float(row["sigma_m"]) == pytest.approx(0.1)
     assert "ladder" in capsys.readouterr().out
+
+
+def _rows(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_verdict_prints_models_that_can_be_pasted(tmp_path, capsys):
+    kinds = ["--fit-kinds", "harbour", "--check-kinds", "harbour", "--overlaps", "0.7"]
+    assert main(["verdict", "--out", str(tmp_path), "--seeds", "1", "--checks", "1", *kinds]) == 0
+    printed = capsys.readouterr().out
+    assert "pose=(" in printed
+    assert "match=(" in printed
+    assert (tmp_path / "reliability.png").read_bytes()[:4] == b"\x89PNG"
+    for name in ("fit.csv", "check.csv"):
+        rows = _rows(tmp_path / name)
+        assert {row["noise"] for row in rows} == {"clean", "noisy", "hard"}
+        clean = [r for r in rows if r["noise"] == "clean" and r["is_matching"] == "True"]
+        assert all(row["is_right"] == "True" for row in clean)
+        assert all(r["is_right"] == "False" for r in rows if r["is_matching"] == "False")
+
+
+def test_overlap_counts_what_it_accepts(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("UW_DATA_DIR", raising=False)
+    arguments = ["--kinds", "harbour", "--overlaps", "0.7", "--noises", "clean", "--seeds", "2"]
+    assert main(["overlap", "--out", str(tmp_path), *arguments]) == 0
+    rows = _rows(tmp_path / "pairs.csv")
+    assert sum(row["matching"] == "True" for row in rows) == 2
+    for row in rows:
+        if row["accepted"] == "True" and row["right"] == "True":
+            assert float(row["error_cells"]) < 6.0
+            assert float(row["nees"]) >= 0.0
+        assert 0.0 <= float(row["probability"]) <= 1.0
+    assert "clean | 70%" in capsys.readouterr().out
+    assert (tmp_path / "overlap.png").exists()
+
+
+def test_field_scores_all_methods_on_the_same_pairs(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("UW_DATA_DIR", raising=False)
+    arguments = ["--kinds", "harbour", "--overlaps", "0.7", "--noises", "noisy", "--seeds", "1"]
+    assert main(["field", "--out", str(tmp_path), *arguments]) == 0
+    rows = _rows(tmp_path / "field.csv")
+    assert len({row["method"] for row in rows}) == len(rows) == 7
+    for row in rows:
+        # Nothing is nearer to the map merged by the truth than a map merged within two cells.
+        if row["right"] == "True" and float(row["error_m"]) < 0.1:
+            wrong = [r for r in rows if r["answered"] == "True" and r["right"] == "False"]
+            assert all(float(row["mse"]) < float(r["mse"]) for r in wrong)
+    assert (tmp_path / "harbour_70.png").exists()
+    assert "ORB + RANSAC" in capsys.readouterr().out

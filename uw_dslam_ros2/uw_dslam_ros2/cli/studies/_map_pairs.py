@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
 
-__all__ = ["PairSpec", "is_right", "pair_errors", "pair_specs"]
+__all__ = ["PairSpec", "is_right", "pair_errors", "pair_specs", "random_prior"]
 
 RIGHT_CELLS = 6.0
 RIGHT_RAD = math.radians(2.0)
@@ -27,6 +28,8 @@ class PairSpec:
     seed: int
     is_matching: bool = True
     is_sonar: bool = False
+    is_twin: bool = False
+    size_cells: int = 260
 
     def make(self) -> MapPair:
         """The pair."""
@@ -37,6 +40,8 @@ class PairSpec:
             self.seed,
             is_matching=self.is_matching,
             is_sonar=self.is_sonar,
+            is_twin=self.is_twin,
+            size_cells=self.size_cells,
         )
 
 
@@ -57,6 +62,27 @@ def pair_specs(
                     choice = np.random.default_rng((seed, number, len(kind), len(noise)))
                     if choice.random() < share_of_different:
                         yield PairSpec(kind, overlap, noise, seed, False, is_sonar)
+
+
+def random_prior(pair: MapPair, rng: np.random.Generator) -> PriorWindow:
+    """A window of random size that holds the truth, or any place where there is none."""
+    size_m = max(pair.source.spec.shape) * pair.source.spec.resolution_m
+    half_m = size_m * float(rng.choice([0.1, 0.2, 0.4]))
+    half_rad = float(rng.choice([0.1, 0.3, math.pi]))
+    middle = pair.source.spec.corners().mean(axis=0)
+    if pair.T_target_source is not None:
+        T_true = pair.T_target_source
+    else:
+        aim = pair.target.spec.corners().mean(axis=0)
+        turned = SE2(yaw=float(rng.uniform(-math.pi, math.pi)))
+        moved = turned.apply(middle)
+        T_true = SE2(float(aim[0] - moved[0]), float(aim[1] - moved[1]), turned.yaw)
+    x, y = T_true.apply(middle)
+    about = SE2(float(x), float(y), 0.0)
+    shift = rng.uniform(-half_m, half_m, 2)
+    error = SE2(float(shift[0]), float(shift[1]), float(rng.uniform(-half_rad, half_rad)))
+    # Half as much again, for the prior speaks of the source's origin and not of its middle.
+    return PriorWindow(about @ error @ about.inverse() @ T_true, 1.5 * half_m, half_rad)
 
 
 def pair_errors(pair: MapPair, T_target_source: SE2) -> tuple[float, float]:

@@ -3,14 +3,15 @@
 All methods see the same pairs. MSE and SSIM compare the merged map with the one merged by the true
 motion; success stands beside them, because a method that refuses leaves one map alone and gets a
 flattering MSE. ICP and NDT also get 36 starting headings. The pictures show submap boundaries in
-red dots, passable space white, unknown grey, walls black.
+red dots, passable space white, unknown grey, walls black. Where UW_DATA_DIR is set, submaps of a
+real marina that share at least 30 % are matched as well.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from uw_dslam_ros2.cli.studies._common import (
     write_csv,
 )
 from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, is_right, pair_errors
+from uw_dslam_ros2.cli.studies._real_pairs import has_recording, real_pairs
 from uw_dslam_ros2.core.features.grid_points import grid_points
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.metrics import compare_maps, resample
@@ -39,18 +41,39 @@ Row = dict[str, Any]
 Method = Callable[[MapPair], SE2 | None]
 _NUM_POINTS = 800
 _FIRST_SEED = 3000  # others than those of `study verdict`
+_LEAST_REAL_OVERLAP = 0.3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this study."""
-    parser.add_argument("--seeds", type=int, default=3, help="places of each kind (%(default)s)")
+    parser.add_argument("--seeds", type=int, default=1, help="places of each kind (%(default)s)")
     parser.add_argument("--kinds", nargs="+", default=["harbour", "lake", "office"])
     parser.add_argument("--overlaps", nargs="+", type=float, default=[0.7, 0.5, 0.3])
     parser.add_argument("--noises", nargs="+", default=["clean", "noisy", "hard"])
+    parser.add_argument("--real", type=int, default=8, help="most real pairs (%(default)s)")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="recordings ($UW_DATA_DIR)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Register every pair with every method; table, CSV file, pictures of the first pairs."""
+    rows: list[Row] = []
+    for spec, pair in progress(_pairs(args), text="pairs"):
+        motions = {name: method(pair) for name, method in _methods().items()}
+        rows.extend(_scored(spec, pair, name, motion) for name, motion in motions.items())
+        if spec.seed in (_FIRST_SEED, 0) and spec.noise in ("noisy", "real"):
+            _draw(args.out / f"{spec.kind}_{round(100 * spec.overlap)}.png", pair, motions)
+    write_csv(args.out / "field.csv", rows)
+    print_table(
+        (
+            "places", "method", "right", "wrong", "MSE", "SSIM", "median error [m]",
+            "median error [deg]",
+        ),
+        _table(rows),
+    )  # fmt: skip
+    return 0
+
+
+def _pairs(args: argparse.Namespace) -> list[tuple[PairSpec, MapPair]]:
     specs = [
         PairSpec(kind, overlap, noise, seed)
         for seed in range(_FIRST_SEED, _FIRST_SEED + args.seeds)
@@ -58,23 +81,22 @@ def run(args: argparse.Namespace) -> int:
         for overlap in args.overlaps
         for noise in args.noises
     ]
-    rows: list[Row] = []
-    for number, spec in enumerate(progress(specs, text="pairs")):
-        pair = spec.make()
-        motions = {name: method(pair) for name, method in _methods().items()}
-        rows.extend(_scored(spec, pair, name, motion) for name, motion in motions.items())
-        if (
-            number < len(args.kinds) * len(args.overlaps) * len(args.noises)
-            and spec.noise == "noisy"
-        ):
-            _draw(args.out / f"{spec.kind}_{int(100 * spec.overlap)}.png", pair, motions)
-    write_csv(args.out / "field.csv", rows)
-    table = []
-    for name in _methods():
-        own = [r for r in rows if r["method"] == name]
-        answered = [r for r in own if r["answered"]]
-        table.append(
-            (
+    pairs = [(spec, spec.make()) for spec in specs]
+    if args.data is not None or has_recording():
+        real = [p for p in real_pairs(args.data) if p.overlap >= _LEAST_REAL_OVERLAP]
+        step = max(1, len(real) // max(args.real, 1))
+        for number, pair in enumerate(real[::step][: args.real]):
+            pairs.append((PairSpec("aracati", pair.overlap, "real", number), pair))
+    return pairs
+
+
+def _table(rows: list[Row]) -> Iterator[tuple[str, ...]]:
+    for kind in dict.fromkeys(r["kind"] for r in rows):
+        for name in _methods():
+            own = [r for r in rows if (r["kind"], r["method"]) == (kind, name)]
+            answered = [r for r in own if r["answered"]]
+            yield (
+                kind,
                 name,
                 f"{np.mean([r['right'] for r in own]):.2f}",
                 f"{np.mean([r['answered'] and not r['right'] for r in own]):.2f}",
@@ -83,12 +105,6 @@ def run(args: argparse.Namespace) -> int:
                 f"{np.median([r['error_m'] for r in answered]):.2f}" if answered else "-",
                 f"{np.median([r['error_deg'] for r in answered]):.2f}" if answered else "-",
             )
-        )
-    print_table(
-        ("method", "right", "wrong", "MSE", "SSIM", "median error [m]", "median error [deg]"),
-        table,
-    )
-    return 0
 
 
 def _points(pair: MapPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

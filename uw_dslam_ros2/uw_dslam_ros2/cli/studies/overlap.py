@@ -1,7 +1,8 @@
 """How little overlap is too little: success, refusal and error of map registration over overlap.
 
-Pairs of harbours, lakes, offices and caves, half of them again with maps of two places; each with
-its proof. Writes a table, a CSV file, the curve and the reliability diagram.
+Pairs of harbours, lakes and buildings, half of them again with maps of two places, and, where
+UW_DATA_DIR is set, all pairs of submaps of a real marina; each with its proof. Writes tables, a
+CSV file, the curve and the reliability diagram.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +21,15 @@ from uw_dslam_ros2.cli.studies._common import (
     print_table,
     progress,
     save_figure,
+    share_interval,
     write_csv,
 )
 from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, is_right, pair_errors, pair_specs
+from uw_dslam_ros2.cli.studies._real_pairs import has_recording, real_pairs
 from uw_dslam_ros2.core.registration.grids import register_grids
+from uw_dslam_ros2.core.registration.result import RegistrationResult
+from uw_dslam_ros2.core.se2 import wrap_angle
+from uw_dslam_ros2.sim.map_pairs import MapPair
 
 Row = dict[str, Any]
 _FIRST_SEED = 2000  # others than those of `study verdict`
@@ -30,18 +37,22 @@ _FIRST_SEED = 2000  # others than those of `study verdict`
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this study."""
-    parser.add_argument("--seeds", type=int, default=3, help="places of each kind (%(default)s)")
+    parser.add_argument("--seeds", type=int, default=2, help="places of each kind (%(default)s)")
     parser.add_argument(
-        "--kinds", nargs="+", default=["harbour", "lake", "office", "cave"], help="kinds of places"
+        "--kinds",
+        nargs="+",
+        default=["harbour", "lake", "corridors", "oblique"],
+        help="kinds of places",
     )
     parser.add_argument(
         "--overlaps", nargs="+", type=float, default=[0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0]
     )
     parser.add_argument("--noises", nargs="+", default=["clean", "noisy", "hard"])
+    parser.add_argument("--data", type=Path, metavar="DIR", help="recordings ($UW_DATA_DIR)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Register all pairs, print the table, draw."""
+    """Register all pairs, print the tables, draw."""
     specs = list(
         pair_specs(
             tuple(args.kinds),
@@ -50,22 +61,29 @@ def run(args: argparse.Namespace) -> int:
             range(_FIRST_SEED, _FIRST_SEED + args.seeds),
         )
     )
-    rows = [_registered(spec) for spec in progress(specs, text="pairs")]
+    rows = [_registered(spec, spec.make()) for spec in progress(specs, text="pairs")]
+    if args.data is not None or has_recording():
+        real = real_pairs(args.data)
+        rows += [
+            _registered(PairSpec("aracati", pair.overlap, "real", number), pair)
+            for number, pair in enumerate(progress(real, text="real pairs"))
+        ]
     write_csv(args.out / "pairs.csv", rows)
-    table = []
-    for noise in args.noises:
-        for overlap in args.overlaps:
-            same = [
-                r for r in rows if r["matching"] and (r["noise"], r["overlap"]) == (noise, overlap)
-            ]
-            if same:
-                table.append((noise, f"{overlap:.0%}", len(same), *_shares(same)))
     print_table(
-        ("noise", "overlap", "pairs", "right", "accepted, right", "accepted, wrong"), table
-    )
+        (
+            "noise", "overlap", "pairs", "right", "accepted, right", "accepted, wrong",
+            "certified", "median cells", "median deg", "NEES",
+        ),
+        _table(rows, args),
+    )  # fmt: skip
     different = [r for r in rows if not r["matching"]]
     wrong = sum(r["accepted"] for r in different)
-    print(f"maps of different places: {wrong} of {len(different)} accepted")
+    if different:
+        low, high = share_interval(wrong, len(different))
+        print(
+            f"maps of different places: {wrong} of {len(different)} accepted "
+            f"(95 %: {low:.1%} to {high:.1%})"
+        )
     seconds = [r["seconds"] for r in rows]
     print(f"time: median {np.median(seconds):.2f} s, p95 {np.quantile(seconds, 0.95):.2f} s")
     _draw_curve(args.out / "overlap.png", rows, args)
@@ -73,8 +91,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _registered(spec: PairSpec) -> Row:
-    pair = spec.make()
+def _registered(spec: PairSpec, pair: MapPair) -> Row:
     result = register_grids(pair.source, pair.target, clock=time.monotonic)
     error_m, error_rad = pair_errors(pair, result.T_target_source)
     return {
@@ -83,24 +100,58 @@ def _registered(spec: PairSpec) -> Row:
         "noise": spec.noise,
         "seed": spec.seed,
         "sonar": spec.is_sonar,
-        "matching": spec.is_matching,
+        "matching": pair.T_target_source is not None,
         "right": is_right(pair, result.T_target_source),
         "accepted": result.is_accepted,
         "verdict": result.verdict.name,
         "certified": result.is_certified,
         "probability": result.probability,
-        "error_m": error_m,
+        "error_cells": error_m / pair.source.spec.resolution_m,
         "error_deg": math.degrees(error_rad),
+        "nees": _nees(pair, result),
+        "gap": result.gap,
         "boxes": result.num_boxes,
         "seconds": result.seconds,
     }
 
 
-def _shares(rows: list[Row]) -> tuple[str, str, str]:
+def _nees(pair: MapPair, result: RegistrationResult) -> float:
+    """Squared error over the stated covariance; 3 on average where that is true."""
+    if pair.T_target_source is None:
+        return math.nan
+    error = result.T_target_source.as_array() - pair.T_target_source.as_array()
+    error[2] = wrap_angle(error[2])
+    return float(error @ np.linalg.solve(result.covariance, error))
+
+
+def _table(rows: list[Row], args: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
+    for noise in (*args.noises, "real"):
+        same = [r for r in rows if r["matching"] and r["noise"] == noise]
+        if noise == "real":
+            bins = [(low, high) for low, high in ((0.02, 0.2), (0.2, 0.5), (0.5, 1.01))]
+            groups = {
+                f"{low:.0%} to {min(high, 1.0):.0%}": [
+                    r for r in same if low <= r["overlap"] < high
+                ]
+                for low, high in bins
+            }
+        else:
+            groups = {f"{o:.0%}": [r for r in same if r["overlap"] == o] for o in args.overlaps}
+        for name, members in groups.items():
+            if members:
+                yield noise, name, len(members), *_shares(members)
+
+
+def _shares(rows: list[Row]) -> tuple[str, ...]:
     right = np.mean([r["right"] for r in rows])
-    kept = np.mean([r["right"] and r["accepted"] for r in rows])
+    kept = [r for r in rows if r["right"] and r["accepted"]]
     wrong = np.mean([r["accepted"] and not r["right"] for r in rows])
-    return f"{right:.2f}", f"{kept:.2f}", f"{wrong:.3f}"
+    answer = [f"{right:.2f}", f"{len(kept) / len(rows):.2f}", f"{wrong:.3f}"]
+    answer.append(f"{np.mean([r['certified'] for r in rows if r['accepted']] or [0]):.2f}")
+    for name in ("error_cells", "error_deg"):
+        answer.append(f"{np.median([r[name] for r in kept]):.2f}" if kept else "-")
+    answer.append(f"{np.mean([r['nees'] for r in kept]):.1f}" if kept else "-")
+    return tuple(answer)
 
 
 def _draw_curve(path: Path, rows: list[Row], args: argparse.Namespace) -> None:

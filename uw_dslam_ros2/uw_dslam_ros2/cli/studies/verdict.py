@@ -1,121 +1,278 @@
-"""Fit the probability of a map match, and show its calibration on places of other kinds.
+"""Fit the probability of a map match on some places, and judge it on others.
 
-The evidence of simulated pairs (of one place, of different places) is gathered without the proof,
-a small ridge-regularised logistic model is fitted to whether the best pose is right, and checked
-on other seeds and on a kind of place that the fit never saw.
+Evidence of simulated pairs is gathered without the proof: of one place, of different places, of
+symmetric ones, of the two like ends of one basin; half of the pairs once more with a prior window
+of random size. Two small logistic models are fitted: whether a pose is right, from what speaks for
+it by itself; and whether the best pose is right, in view of its strongest rival. The models are
+judged on other seeds and on kinds of places that the fit never saw. The coefficients that this
+command prints are those of `uw_dslam_ros2.core.registration.verdict.MODELS`.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
-from uw_dslam_ros2.cli.studies._common import figure, print_table, progress, save_figure
-from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, is_right, pair_specs
-from uw_dslam_ros2.core.registration.grids import match_evidence
-from uw_dslam_ros2.core.registration.verdict import FEATURE_NAMES, evidence_features
+from uw_dslam_ros2.cli.studies._common import (
+    figure,
+    print_table,
+    progress,
+    save_figure,
+    share_interval,
+)
+from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, is_right, random_prior
+from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, match_evidence
+from uw_dslam_ros2.core.registration.result import Verdict
+from uw_dslam_ros2.core.registration.verdict import (
+    MATCH_FEATURES,
+    POSE_FEATURES,
+    MatchEvidence,
+    VerdictModels,
+    decide,
+    match_features,
+    pose_features,
+    probability_of,
+)
 
 FloatArray = NDArray[np.float64]
 
-_FIT_KINDS = ("harbour", "lake", "office")
-_CHECK_KINDS = ("harbour", "lake", "office", "cave")
-_OVERLAPS = (0.1, 0.3, 0.5, 0.7, 1.0)
+_FIT_KINDS = ("corridors", "office", "hall", "harbour", "lake", "basin", "symmetric")
+_CHECK_KINDS = ("oblique", "cellular", "cave", "corridors", "harbour", "symmetric")
+_WATERS = ("harbour", "lake", "cave")
+_OVERLAPS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _NOISES = ("clean", "noisy", "hard")
-_RIDGE = 0.1
+_SIZES = (260, 260, 260, 160, 400)
+_FIRST_CHECK = 1000
+_RIDGE = 1.0
+# How rare a basin is whose other end looks the same, against the other places: nothing in the maps
+# of its ends can tell them apart where piers and corners are the same.
+_BASIN_WEIGHT = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    spec: PairSpec
+    has_prior: bool
+    is_right: bool
+    evidence: MatchEvidence
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this study."""
     parser.add_argument("--seeds", type=int, default=2, help="seeds of the fit (%(default)s)")
     parser.add_argument("--checks", type=int, default=1, help="seeds held out (%(default)s)")
+    parser.add_argument("--fit-kinds", nargs="+", default=list(_FIT_KINDS), help="places fitted")
+    parser.add_argument(
+        "--check-kinds", nargs="+", default=list(_CHECK_KINDS), help="places judged on"
+    )
+    parser.add_argument("--overlaps", nargs="+", type=float, default=list(_OVERLAPS))
 
 
 def run(args: argparse.Namespace) -> int:
     """Gather, fit, check, draw."""
     fit = _gathered(
-        args.out / "fit.csv", pair_specs(_FIT_KINDS, _OVERLAPS, _NOISES, range(args.seeds))
+        args.out / "fit.csv",
+        _specs(args.fit_kinds, args.overlaps, range(args.seeds)),
     )
-    first = 1000
+    models = _fitted(fit)
     check = _gathered(
         args.out / "check.csv",
-        pair_specs(_CHECK_KINDS, _OVERLAPS, _NOISES, range(first, first + args.checks)),
+        _specs(args.check_kinds, args.overlaps, range(_FIRST_CHECK, _FIRST_CHECK + args.checks)),
     )
-    model = LogisticRegression(C=1.0 / _RIDGE, max_iter=2000).fit(fit[:, 1:], fit[:, 0])
-    coefficients = [float(model.intercept_[0]), *map(float, model.coef_[0])]
-    print_table(
-        ("feature", "coefficient"),
-        [
-            (name, f"{value:.4f}")
-            for name, value in zip(("intercept", *FEATURE_NAMES), coefficients, strict=True)
-        ],
-    )
-    probability = model.predict_proba(check[:, 1:])[:, 1]
-    print_table(
-        ("threshold", "right kept", "wrong kept"),
-        [
-            (
-                f"{threshold}",
-                f"{(probability[check[:, 0] > 0] >= threshold).mean():.3f}",
-                f"{(probability[check[:, 0] == 0] >= threshold).mean():.4f}",
-            )
-            for threshold in (0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
-        ],
-    )
-    _draw(args.out / "reliability.png", probability, check[:, 0])
+    _print_models(models)
+    for name, trials in (("fitted", fit), ("held out", check)):
+        print(f"\n{name}: {len(trials)} answers")
+        _print_thresholds(trials, models)
+    print("\nverdicts on the held-out pairs, by the default settings")
+    _print_verdicts(check, models)
+    _draw(args.out / "reliability.png", {"fitted": fit, "held out": check}, models)
     return 0
 
 
-def _gathered(path: Path, specs: Iterable[PairSpec]) -> FloatArray:
-    """Rows [is right, features ...] of all pairs; kept in a CSV file."""
-    rows = []
-    with path.open("w", newline="") as file:
+def _specs(kinds: Iterable[str], overlaps: Iterable[float], seeds: range) -> Iterator[PairSpec]:
+    """Pairs of all kinds, overlaps and noises; some again with maps of two places, or of twins."""
+    for seed in seeds:
+        for kind in kinds:
+            rng = np.random.default_rng((seed, sum(kind.encode())))
+            for overlap in overlaps:
+                for noise in _NOISES:
+                    is_sonar = kind in _WATERS and rng.random() < 0.35
+                    size = int(rng.choice(_SIZES))
+                    other = rng.random() < 0.6
+                    # Where windows of a symmetric place share little, its half turn fits better
+                    # than the truth, and nothing in the maps can tell.
+                    if kind != "symmetric" or overlap >= 0.5:
+                        yield PairSpec(kind, overlap, noise, seed, True, is_sonar, False, size)
+                    if other:
+                        is_twin = kind == "basin"
+                        yield PairSpec(kind, overlap, noise, seed, False, is_sonar, is_twin, size)
+
+
+def _gathered(path: Path, specs: Iterable[PairSpec]) -> list[_Trial]:
+    """Evidence of all pairs; what the models see of it is kept in a CSV file."""
+    trials: list[_Trial] = []
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(
-            ("kind", "overlap", "noise", "seed", "matching", "sonar", "right", *FEATURE_NAMES)
-        )
-        for spec in progress(list(specs), text=path.stem):
+        names = (*PairSpec.__annotations__, "has_prior", "is_right", *POSE_FEATURES, "rival_share")
+        writer.writerow(names)
+        for number, spec in enumerate(progress(list(specs), text=path.stem)):
             pair = spec.make()
-            found = match_evidence(pair.source, pair.target)
-            if found is None:
-                continue
-            evidence, motion = found
-            row = (float(is_right(pair, motion)), *evidence_features(evidence))
-            writer.writerow(
-                (
-                    spec.kind,
-                    spec.overlap,
-                    spec.noise,
-                    spec.seed,
-                    spec.is_matching,
-                    spec.is_sonar,
-                    *row,
-                )
+            rng = np.random.default_rng((number, spec.seed))
+            for has_prior in (False, True)[: 1 + int(rng.random() < 0.5)]:
+                prior = random_prior(pair, rng) if has_prior else None
+                found = match_evidence(pair.source, pair.target, prior=prior)
+                if found is None:
+                    continue
+                evidence, motion = found
+                trials.append(_Trial(spec, has_prior, is_right(pair, motion), evidence))
+                features = pose_features(evidence.best, evidence.log_volume)
+                writer.writerow(
+                    (*asdict(spec).values(), has_prior, trials[-1].is_right, *features,
+                     evidence.rival_share)
+                )  # fmt: skip
+    return trials
+
+
+def _fitted(trials: list[_Trial]) -> VerdictModels:
+    """Both models, one after the other.
+
+    A pose in a symmetric place is convincing for itself wherever it is, so such places teach the
+    second model only.
+    """
+    plain = [t for t in trials if t.spec.kind != "symmetric"]
+    features = [pose_features(t.evidence.best, t.evidence.log_volume) for t in plain]
+    pose = _logistic(features, plain)
+    return VerdictModels(
+        pose, _logistic([match_features(t.evidence, pose) for t in trials], trials)
+    )
+
+
+def _logistic(rows: list[tuple[float, ...]], trials: list[_Trial]) -> tuple[float, ...]:
+    """Coefficients, intercept first, of a ridge-regularised logistic model."""
+    features = np.array(rows)
+    is_right = np.array([t.is_right for t in trials])
+    weight = np.array([_BASIN_WEIGHT if t.spec.kind == "basin" else 1.0 for t in trials])
+    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-9
+    model = LogisticRegression(C=1.0 / _RIDGE, max_iter=5000)
+    model.fit((features - mean) / spread, is_right, sample_weight=weight)
+    slopes = model.coef_[0] / spread
+    intercept = float(model.intercept_[0] - slopes @ mean)
+    return tuple(round(value, 4) for value in (intercept, *map(float, slopes)))
+
+
+def _print_models(models: VerdictModels) -> None:
+    for name, features, model in (
+        ("pose", POSE_FEATURES, models.pose),
+        ("match", MATCH_FEATURES, models.match),
+    ):
+        print_table(
+            (f"feature of model {name}", "coefficient"),
+            zip(("intercept", *features), model, strict=True),
+        )
+        print(f"{name}={model}")
+
+
+def _groups(trials: list[_Trial]) -> dict[str, list[_Trial]]:
+    """Trials by what is asked of them; those with a prior by themselves."""
+
+    def group(trial: _Trial) -> str:
+        spec = trial.spec
+        if spec.is_twin:
+            return "like ends of one basin"
+        if not spec.is_matching:
+            return "different places"
+        if spec.kind in ("symmetric", "basin"):
+            return "symmetric place"
+        if trial.has_prior:
+            return "prior window"
+        if spec.overlap >= 0.5:
+            return "overlap 50 % and more"
+        return f"overlap {spec.overlap:.0%}".replace("%", " %")
+
+    groups: dict[str, list[_Trial]] = {}
+    for trial in trials:
+        groups.setdefault(group(trial), []).append(trial)
+    return dict(sorted(groups.items()))
+
+
+def _print_thresholds(trials: list[_Trial], models: VerdictModels) -> None:
+    probability = np.array([probability_of(t.evidence, models) for t in trials])
+    right = np.array([t.is_right for t in trials])
+    groups = _groups(trials)
+    much = np.isin(
+        [id(t) for t in trials], [id(t) for t in groups.get("overlap 50 % and more", [])]
+    )
+    some = np.isin([id(t) for t in trials], [id(t) for t in groups.get("overlap 30 %", [])])
+    other = np.array([not t.spec.is_matching for t in trials])
+    rows = []
+    for threshold in (0.5, 0.7, 0.8, 0.9, 0.95, 0.98):
+        is_kept = probability >= threshold
+        rows.append(
+            (
+                threshold,
+                *(f"{(is_kept & right)[mask].mean():.3f}" if mask.any() else "-"
+                  for mask in (much, some)),
+                f"{int((is_kept & ~right).sum())} of {int((~right).sum())}",
+                f"{int((is_kept & other).sum())} of {int(other.sum())}",
             )
-            rows.append(row)
-    return np.array(rows)
+        )  # fmt: skip
+    print_table(("threshold", "right, 50 % and more", "right, 30 %", "wrong", "of no match"), rows)
 
 
-def _draw(path: Path, probability: FloatArray, right: FloatArray) -> None:
+def _print_verdicts(trials: list[_Trial], models: VerdictModels) -> None:
+    config = GridRegistrationConfig()
+    rows = []
+    for name, members in _groups(trials).items():
+        verdicts = [decide(t.evidence, config, models)[0] for t in members]
+        accepted = [v is Verdict.ACCEPTED for v in verdicts]
+        kept = sum(a and t.is_right for a, t in zip(accepted, members, strict=True))
+        wrong = sum(a and not t.is_right for a, t in zip(accepted, members, strict=True))
+        low, high = share_interval(wrong, len(members))
+        rows.append(
+            (
+                name,
+                len(members),
+                f"{np.mean([t.is_right for t in members]):.2f}",
+                f"{kept / len(members):.2f}",
+                f"{wrong}, {low:.1%} to {high:.1%}",
+                sum(v is Verdict.AMBIGUOUS for v in verdicts),
+            )
+        )
+    print_table(
+        ("pairs", "answers", "right", "accepted, right", "accepted, wrong (95 %)", "ambiguous"),
+        rows,
+    )
+
+
+def _draw(path: Path, sets: dict[str, list[_Trial]], models: VerdictModels) -> None:
     """Reliability diagram: share of right matches over the stated probability."""
-    edges = np.linspace(0.0, 1.0, 11)
-    which = np.clip(np.digitize(probability, edges) - 1, 0, 9)
-    used = [k for k in range(10) if (which == k).any()]
-    stated = [probability[which == k].mean() for k in used]
-    share = [right[which == k].mean() for k in used]
     picture, (row,) = figure()
     axes = row[0]
     axes.plot([0, 1], [0, 1], "k:", linewidth=0.8)
-    axes.plot(stated, share, "o-")
-    for k, x, y in zip(used, stated, share, strict=True):
-        axes.annotate(
-            str(int((which == k).sum())), (x, y), textcoords="offset points", xytext=(4, -8)
-        )
+    edges = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0])
+    for name, trials in sets.items():
+        probability = np.array([probability_of(t.evidence, models) for t in trials])
+        right = np.array([t.is_right for t in trials])
+        which = np.clip(np.digitize(probability, edges) - 1, 0, len(edges) - 2)
+        used = [k for k in range(len(edges) - 1) if (which == k).any()]
+        stated = [probability[which == k].mean() for k in used]
+        share = [right[which == k].mean() for k in used]
+        counts = [int((which == k).sum()) for k in used]
+        errors = []
+        for k, value in zip(used, share, strict=True):
+            low, high = share_interval(int(right[which == k].sum()), int((which == k).sum()))
+            errors.append((max(value - low, 0.0), max(high - value, 0.0)))
+        axes.errorbar(stated, share, np.array(errors).T, fmt="o-", label=name, capsize=2)
+        for x, y, count in zip(stated, share, counts, strict=True):
+            axes.annotate(str(count), (x, y), textcoords="offset points", xytext=(4, -9))
     axes.set_xlabel("stated probability")
     axes.set_ylabel("share of right matches")
+    axes.legend(loc="upper left")
     save_figure(picture, path)

@@ -110,22 +110,27 @@ def clean_cells(occupancy: OccupancyMap) -> CellEvidence:
     for _ in range(2):  # specks that leaned on specks go in the second round
         wall = _keep_lines(wall, offsets, _MIN_LINE_CELLS)
     body, wall = wall, _surface(wall)
-    size = (_MAJORITY_WIDTH_CELLS, _MAJORITY_WIDTH_CELLS)
-    is_free = ((values >= 0) & (values <= _FREE_MAX_PERCENT)).astype(np.float32)
-    free = cv2.boxFilter(is_free, -1, size, borderType=cv2.BORDER_CONSTANT) > 0.5
-    is_known = (values >= 0).astype(np.float32)
-    known = cv2.boxFilter(is_known, -1, size, borderType=cv2.BORDER_REPLICATE) > 0.5
+    free = _is_majority((values >= 0) & (values <= _FREE_MAX_PERCENT), cv2.BORDER_CONSTANT)
+    known = _is_majority(values >= 0, cv2.BORDER_REPLICATE)
     free &= ~body
-    evidence = np.clip((values.astype(np.float32) - 50.0) / 40.0, 0.0, 1.0)
-    rows, cols = np.indices(values.shape).astype(np.float32) + np.float32(0.5)
+    evidence = np.zeros(values.shape, np.float32)
+    evidence[wall] = np.clip((values[wall].astype(np.float32) - 50.0) / 40.0, 0.0, 1.0)
+    rows, cols = (np.arange(size, dtype=np.float32) + np.float32(0.5) for size in values.shape)
     return CellEvidence(
         occupancy.spec.resolution_m,
-        np.where(wall, evidence, np.float32(0.0)),
+        evidence,
         free.astype(np.float32),
         (known | body).astype(np.float32),
-        rows,
-        cols,
+        np.broadcast_to(rows[:, None], values.shape),
+        np.broadcast_to(cols, values.shape),
     )
+
+
+def _is_majority(mask: NDArray[np.bool_], border: int) -> NDArray[np.bool_]:
+    """Whether most cells of the square around each cell are set."""
+    size = (_MAJORITY_WIDTH_CELLS, _MAJORITY_WIDTH_CELLS)
+    count = cv2.boxFilter(mask.view(np.uint8), -1, size, normalize=False, borderType=border)
+    return count > _MAJORITY_WIDTH_CELLS**2 // 2
 
 
 def coarsen(cells: CellEvidence, resolution_m: float) -> CellEvidence:

@@ -26,8 +26,11 @@ class GridRegistrationConfig(Config):
     finest_cells: int = setting(1000, 100, 4000, "longer side of a map in the refinement")
     max_side_cells: int = setting(8000, 100, 100000, "maps with a longer side are refused")
     gap: float = setting(0.1, 0.001, 0.5, "relative gap of the certificate")
-    max_boxes: int = setting(1_500_000, 1000, 1_000_000_000, "search boxes before giving up")
-    max_seconds: float = setting(20.0, 0.1, 3600.0, "time before giving up [s]; needs a clock")
+    max_boxes: int = setting(200_000, 1000, 1_000_000_000, "boxes before the proof is given up")
+    max_seconds: float = setting(20.0, 0.1, 3600.0, "time for the proof [s]; needs a clock")
+    is_proof_required: bool = setting(
+        False, doc="refuse a match, however probable, whose proof stayed wider than the gap"
+    )
     min_wall_cells: int = setting(25, 1, 100000, "fewer wall cells in a map are too few")
     min_overlap: float = setting(0.1, 0.0, 1.0, "least common seen area, share of the smaller")
     max_conflict: float = setting(0.4, 0.0, 1.0, "walls on free space, share of common walls")
@@ -37,4 +40,4 @@ class GridRegistrationConfig(Config):
     max_slide_share: float = setting(
         0.85, 0.1, 1.0, "score ten cells off in the weakest direction; a straight wall keeps it"
     )
-    min_probability: float = setting(0.9, 0.0, 1.0, "least probability of an accepted match")
+    min_probability: float = setting(0.8, 0.0, 1.0, "least probability of an accepted match")

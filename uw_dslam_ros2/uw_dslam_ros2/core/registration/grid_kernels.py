@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["bound_boxes", "objective", "objective_at"]
+__all__ = ["ascend", "bound_boxes", "objective", "objective_at"]
 
 FloatGrid = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -88,6 +88,72 @@ def objective(
         d_x -= weight * (cos * gx - sin * gy)
         d_y -= weight * (sin * gx + cos * gy)
     return total, d_theta, d_x, d_y
+
+
+@njit(cache=True, nogil=True)
+def ascend(
+    start: FloatArray, radius: float, max_steps: int,
+    source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
+    target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
+    center: FloatArray, pad: float,
+) -> tuple[FloatArray, float]:  # fmt: skip
+    """Local maximum (3,) that a pose climbs to, and its value, by BFGS steps.
+
+    Turns are scaled by ``radius``, so that all three numbers are cells. A step is halved until the
+    value rises enough (Armijo), and never longer than two cells.
+    """
+    scale = np.array([1.0 / radius, 1.0, 1.0])
+    pose = start.copy()
+    value, g0, g1, g2 = objective(
+        pose, source, source_weight, target_field,
+        target, target_weight, source_field, center, pad,
+    )  # fmt: skip
+    gradient = np.array([g0, g1, g2]) * scale
+    inverse = np.eye(3)
+    is_first = True
+    for _ in range(max_steps):
+        step = inverse @ gradient
+        slope = np.dot(step, gradient)
+        if slope <= 0.0:
+            inverse, step = np.eye(3), gradient.copy()
+            slope = np.dot(step, gradient)
+        length = math.sqrt(np.dot(step, step))
+        if length < 1e-7 or slope < 1e-14:
+            break
+        limit = 0.5 if is_first else 2.0
+        share = min(1.0, limit / length)
+        if is_first:
+            share = limit / length
+        is_found = False
+        for _ in range(20):
+            trial = pose + share * step * scale
+            trial_value, g0, g1, g2 = objective(
+                trial, source, source_weight, target_field,
+                target, target_weight, source_field, center, pad,
+            )  # fmt: skip
+            if trial_value >= value + 1e-4 * share * slope:
+                is_found = True
+                break
+            share *= 0.5
+        if not is_found:
+            if is_first:
+                break
+            inverse, is_first = np.eye(3), True
+            continue
+        trial_gradient = np.array([g0, g1, g2]) * scale
+        moved, turned = share * step, gradient - trial_gradient
+        along = np.dot(moved, turned)
+        if along > 1e-12:
+            if is_first:
+                inverse = np.eye(3) * (along / np.dot(turned, turned))
+            left = np.eye(3) - np.outer(moved, turned) / along
+            inverse = left @ inverse @ left.T + np.outer(moved, moved) / along
+            is_first = False
+        has_stalled = trial_value - value < 1e-9
+        pose, value, gradient = trial, trial_value, trial_gradient
+        if has_stalled:
+            break
+    return pose, value
 
 
 @njit(cache=True, nogil=True)

@@ -18,14 +18,21 @@ __all__ = ["Landscape", "scan_landscape"]
 FloatArray = NDArray[np.float64]
 _PEAKS_PER_ROTATION = 4
 _PEAK_RADIUS = 3  # cells
+_CHANCE_STRIDE = 4  # rotations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landscape:
-    """Peaks of the objective, best first: ``poses`` (K, 3), ``scores`` (K,)."""
+    """Peaks of the objective, best first: ``poses`` (K, 3), ``scores`` (K,).
+
+    ``chance_poses`` (L, 3) and ``chance_scores`` (L,) are the best of evenly spaced rotations over
+    the whole plane, whatever the window: what alignments of these two maps reach by chance.
+    """
 
     poses: FloatArray
     scores: FloatArray
+    chance_poses: FloatArray
+    chance_scores: FloatArray
 
 
 def scan_landscape(
@@ -40,26 +47,48 @@ def scan_landscape(
     scan = _Scan(problem)
     num_rotations = max(16, math.ceil(2.0 * math.pi * problem.radius * 1.2 / 1.3))
     poses, scores = [], []
-    for theta in _rotations(num_rotations, window):
+    chance_poses, chance_scores = [], []
+    is_whole = _is_whole(num_rotations, window)
+    for number, theta in enumerate(_rotations(num_rotations, window)):
         scores_here = scan.scores(theta)
+        if is_whole and number % _CHANCE_STRIDE == 0:
+            pose, score = _greatest(scan, theta, scores_here)
+            chance_poses.append(pose)
+            chance_scores.append(score)
         if window is not None:
             scores_here = scan.masked(scores_here, window)
         for row, col, score in _peaks(scores_here):
             if score > -math.inf:
                 poses.append((theta, *scan.shift_of(row, col)))
                 scores.append(score)
-    if not poses:
-        return Landscape(np.empty((0, 3)), np.empty(0))
-    order = np.argsort(scores)[::-1]
-    all_poses, all_scores = np.array(poses)[order], np.array(scores)[order]
+    if not is_whole:
+        for theta in _rotations(num_rotations, None)[::_CHANCE_STRIDE]:
+            pose, score = _greatest(scan, theta, scan.scores(theta))
+            chance_poses.append(pose)
+            chance_scores.append(score)
+    order = np.argsort(scores, kind="stable")[::-1]
+    all_poses, all_scores = np.array(poses).reshape(-1, 3)[order], np.array(scores)[order]
     keep = distinct(all_poses, problem.radius, 3.0, num_peaks)
-    return Landscape(all_poses[keep], all_scores[keep])
+    return Landscape(
+        all_poses[keep], all_scores[keep], np.array(chance_poses), np.array(chance_scores)
+    )
+
+
+def _greatest(
+    scan: _Scan, theta: float, scores: NDArray[np.float32]
+) -> tuple[tuple[float, int, int], float]:
+    row, col = divmod(int(scores.argmax()), scores.shape[1])
+    return (theta, *scan.shift_of(row, col)), float(scores[row, col])
+
+
+def _is_whole(num_rotations: int, window: PoseWindow | None) -> bool:
+    return window is None or float(window.half[0]) > math.pi - 2.0 * math.pi / num_rotations
 
 
 def _rotations(num_rotations: int, window: PoseWindow | None) -> list[float]:
     """Evenly spaced rotations of a window, its middle among them."""
     step = 2.0 * math.pi / num_rotations
-    if window is None or window.half[0] > math.pi - step:
+    if window is None or _is_whole(num_rotations, window):
         return [float(k * step - math.pi) for k in range(num_rotations)]
     num_beside = math.ceil(float(window.half[0]) / step)
     steps = np.arange(-num_beside, num_beside + 1) / num_beside

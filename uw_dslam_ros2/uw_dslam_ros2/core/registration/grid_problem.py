@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence
 from uw_dslam_ros2.core.features.walls import wall_points
@@ -19,6 +18,7 @@ from uw_dslam_ros2.core.se2 import SE2
 __all__ = ["GridProblem", "PoseWindow", "build_problem"]
 
 FloatArray = NDArray[np.float64]
+FloatGrid = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,20 +69,10 @@ class GridProblem:
 
     def ascend(self, pose: FloatArray, max_steps: int = 40) -> tuple[FloatArray, float]:
         """Local maximum that a pose (3,) climbs to, and its value."""
-        scale = np.array([1.0 / self.radius, 1.0, 1.0])
-
-        def negative(scaled: FloatArray) -> tuple[float, FloatArray]:
-            value, *gradient = grid_kernels.objective(scaled * scale, *self.arguments)
-            return -value, -np.array(gradient) * scale
-
-        start = np.asarray(pose, dtype=np.float64)
-        found = minimize(
-            negative, start / scale, jac=True, method="BFGS", options={"maxiter": max_steps}
+        found, value = grid_kernels.ascend(
+            np.array(pose, dtype=np.float64), self.radius, max_steps, *self.arguments
         )
-        value = self.value(start)
-        if -found.fun >= value:
-            return found.x * scale, float(-found.fun)
-        return start, value
+        return found, float(value)
 
     def to_motion(self, pose: FloatArray) -> SE2:
         """Pose (3,) in working cells to the motion between the grids' own axes [m]."""
@@ -109,15 +99,17 @@ def build_problem(
     sigma_cells: float,
     free_penalty: float,
     max_points: int,
+    distances: tuple[FloatGrid | None, FloatGrid | None] = (None, None),
 ) -> GridProblem:
     """Problem on a lattice ``stride`` times coarser than the cells of both sides.
 
-    ``sigma_cells`` (of the working lattice) is the kernel of the walls.
+    ``sigma_cells`` (of the working lattice) is the kernel of the walls. ``distances`` are
+    `wall_distance` of both sides where they are known already.
     """
     sides = []
-    for cells in (source, target):
+    for cells, distance in zip((source, target), distances, strict=True):
         points, weights = wall_points(cells, max_points, spacing_cells=float(stride))
-        wide = signed_field(cells, sigma_cells * stride, free_penalty, stride)
+        wide = signed_field(cells, sigma_cells * stride, free_penalty, stride, distance)
         sides.append((_in_strips(points / stride - 0.5, weights), wide))
     (source_points, source_weights), source_field = sides[0]
     (target_points, target_weights), target_field = sides[1]

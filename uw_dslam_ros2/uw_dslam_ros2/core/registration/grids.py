@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +11,12 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence, clean_cells, coarsen
 from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.registration.grid_candidates import (
+    merge_best,
+    scan_candidates,
+)
 from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grid_landscape import distinct, scan_landscape
+from uw_dslam_ros2.core.registration.grid_evidence import Found, weigh
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow, build_problem
 from uw_dslam_ros2.core.registration.grid_search import (
     SearchLimits,
@@ -25,9 +27,7 @@ from uw_dslam_ros2.core.registration.grid_search import (
 from uw_dslam_ros2.core.registration.paper_grids import register_grids_by_points
 from uw_dslam_ros2.core.registration.refine_grids import (
     WallMap,
-    measure_agreement,
     pose_covariance,
-    slide_share,
 )
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
@@ -37,24 +37,19 @@ from uw_dslam_ros2.core.registration.result import (
     Verdict,
 )
 from uw_dslam_ros2.core.registration.verdict import MatchEvidence, decide
-from uw_dslam_ros2.core.se2 import SE2, wrap_angle
+from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["GridRegistrationConfig", "match_evidence", "register_grids"]
 
 FloatArray = NDArray[np.float64]
 Clock = Callable[[], float]
 
-_NUM_CANDIDATES = 24
-_NUM_REFINED = 8
 _FINE_POINTS = 1200
 _FINE_SIGMA_CELLS = 2.0
 _LEAST_SIDE_CELLS = 4
 _NUM_BOXES_OF_REFUSED = 20_000
 _RIVAL_SHARE = 0.5
-_SLIDE_CELLS = 10.0
-# Errors of neighbouring wall cells go together: bends, and one wall seen from one place.
-_CELLS_PER_PAIR = 40.0
-_RESIDUAL_CELLS = 0.95
+_LEAST_RESIDUAL_CELLS = 0.45
 
 
 def register_grids(
@@ -105,29 +100,18 @@ def register_grids(
 
 
 def match_evidence(
-    source: OccupancyMap, target: OccupancyMap, config: GridRegistrationConfig | None = None
+    source: OccupancyMap,
+    target: OccupancyMap,
+    config: GridRegistrationConfig | None = None,
+    *,
+    prior: PriorWindow | None = None,
 ) -> tuple[MatchEvidence, SE2] | None:
     """What `register_grids` would judge by, and its best pose, without the proof; for studies.
 
     None where a map holds too little to be matched.
     """
-    match = _GridMatch(source, target, config or GridRegistrationConfig(), None, None)
+    match = _GridMatch(source, target, config or GridRegistrationConfig(), prior, None)
     return match.collect()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    pose: FloatArray
-    score: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    # What the evidence refuses anyway gets a short search, which may find better.
-
-    refined: list[_Candidate]
-    shares: tuple[float, ...]
-    evidence: MatchEvidence
 
 
 class _GridMatch:
@@ -149,6 +133,7 @@ class _GridMatch:
         self._source, self._target = source, target
         self._config, self._prior, self._clock = config, prior, clock
         self._start_s = clock() if clock is not None else math.nan
+        self._is_cancelled = False
 
     def run(
         self,
@@ -164,20 +149,15 @@ class _GridMatch:
                     f"the {name} map has {rows} x {cols} cells, more than the limit of "
                     f"{self._config.max_side_cells} on a side",
                 )
-        resolution_m = self._finest_resolution()
-        sides = []
-        for name, occupancy in (("source", self._source), ("target", self._target)):
-            cells = clean_cells(occupancy)
-            if (fault := _too_little(name, occupancy, cells, self._config)) is not None:
-                return self._refused(Verdict.TOO_FEW_FEATURES, fault)
-            sides.append(coarsen(cells, resolution_m))
-        levels = self._levels(sides[0], sides[1])
+        prepared = self._prepare()
+        if isinstance(prepared, str):
+            return self._refused(Verdict.TOO_FEW_FEATURES, prepared)
+        levels, walls = prepared
         window = self._window(levels[0])
-        candidates, surprise = self._scan(levels[0], window)
-        found = self._weigh(sides, levels, self._refine(levels, candidates), surprise)
+        candidates, chance = scan_candidates(levels[0], window)
+        found = weigh(walls, levels, window, candidates, chance)
         verdict, _, _ = decide(found.evidence, self._config)
-        # A match that the evidence refuses anyway gets a short search, in case it finds a better
-        # one.
+        # What the evidence refuses anyway gets a short search, which may find better.
         num_boxes = self._config.max_boxes
         if verdict is not Verdict.ACCEPTED:
             num_boxes = min(num_boxes, _NUM_BOXES_OF_REFUSED)
@@ -185,32 +165,32 @@ class _GridMatch:
             levels[0], window, candidates[0].pose, num_boxes, progress, is_cancelled
         )
         if outcome.lower_bound > candidates[0].score * (1.0 + 1e-6):
-            candidates = _merge_best(levels[0], candidates, outcome)
-            found = self._weigh(sides, levels, self._refine(levels, candidates), surprise)
+            candidates = merge_best(levels[0], candidates, outcome)
+            found = weigh(walls, levels, window, candidates, chance)
         return self._answer(levels, outcome, found)
 
     def collect(self) -> tuple[MatchEvidence, SE2] | None:
         """Evidence for the best pose, and the pose; None where a map holds too little."""
+        prepared = self._prepare()
+        if isinstance(prepared, str):
+            return None
+        levels, walls = prepared
+        window = self._window(levels[0])
+        candidates, chance = scan_candidates(levels[0], window)
+        found = weigh(walls, levels, window, candidates, chance)
+        return found.evidence, self._to_frame(levels[-1].to_motion(found.refined[0].pose))
+
+    def _prepare(self) -> tuple[list[GridProblem], tuple[WallMap, WallMap]] | str:
+        """Problems from coarse to fine, and both maps; or what a map lacks, as a sentence."""
         resolution_m = self._finest_resolution()
         sides = []
         for name, occupancy in (("source", self._source), ("target", self._target)):
             cells = clean_cells(occupancy)
-            if _too_little(name, occupancy, cells, self._config) is not None:
-                return None
+            if (fault := _too_little(name, occupancy, cells, self._config)) is not None:
+                return fault
             sides.append(coarsen(cells, resolution_m))
-        levels = self._levels(sides[0], sides[1])
-        candidates, surprise = self._scan(levels[0], self._window(levels[0]))
-        found = self._weigh(sides, levels, self._refine(levels, candidates), surprise)
-        return found.evidence, self._to_frame(levels[-1].to_motion(found.refined[0].pose))
-
-    def _scan(self, problem: GridProblem, window: PoseWindow) -> tuple[list[_Candidate], float]:
-        """Candidates of the whole window, best first, and how far the best stands out."""
-        landscape = scan_landscape(problem, _NUM_CANDIDATES, window)
-        candidates = _climb(problem, landscape.poses)
-        candidates = [c for c in candidates if _is_inside(window, c.pose)]
-        if not candidates:
-            candidates = [_Candidate(window.middle, problem.value(window.middle))]
-        return candidates, _surprise(candidates, problem.radius)
+        walls = (WallMap(sides[0]), WallMap(sides[1]))
+        return self._levels(*walls), walls
 
     def _finest_resolution(self) -> float:
         specs = (self._source.spec, self._target.spec)
@@ -219,9 +199,9 @@ class _GridMatch:
         # A whole multiple, whose sums are quick.
         return coarser * math.ceil(longest_m / coarser / self._config.finest_cells - 1e-9)
 
-    def _levels(self, source: CellEvidence, target: CellEvidence) -> list[GridProblem]:
+    def _levels(self, source: WallMap, target: WallMap) -> list[GridProblem]:
         """Problems from the searched lattice to the finest one."""
-        longest = max(*source.shape, *target.shape)
+        longest = max(*source.cells.shape, *target.cells.shape)
         stride = max(1, math.ceil(longest / self._config.working_cells))
         strides = [stride]
         while strides[-1] > 1:
@@ -231,12 +211,13 @@ class _GridMatch:
             is_search = stride == strides[0]
             levels.append(
                 build_problem(
-                    source,
-                    target,
+                    source.cells,
+                    target.cells,
                     stride=stride,
                     sigma_cells=self._config.sigma_cells if stride > 1 else _FINE_SIGMA_CELLS,
                     free_penalty=self._config.free_penalty,
                     max_points=self._config.max_points if is_search else _FINE_POINTS,
+                    distances=(source.distance, target.distance),
                 )
             )
         return levels
@@ -283,6 +264,7 @@ class _GridMatch:
     ) -> SearchOutcome:
         def should_stop() -> bool:
             if is_cancelled is not None and is_cancelled():
+                self._is_cancelled = True
                 return True
             clock = self._clock
             return clock is not None and clock() - self._start_s > self._config.max_seconds
@@ -297,56 +279,32 @@ class _GridMatch:
         limits = SearchLimits(self._config.gap, num_boxes, should_stop)
         return search_poses(problem, window, start, limits, report)
 
-    def _refine(self, levels: list[GridProblem], candidates: list[_Candidate]) -> list[_Candidate]:
-        """The candidates' maxima on the finest level, best first, apart from each other."""
-        refined = candidates[:_NUM_REFINED]
-        for coarse, fine in itertools.pairwise(levels):
-            poses = [fine.to_pose(coarse.to_motion(c.pose)) for c in refined]
-            refined = _climb(fine, np.array(poses))
-        return refined
-
-    def _weigh(
-        self,
-        sides: list[CellEvidence],
-        levels: list[GridProblem],
-        refined: list[_Candidate],
-        surprise: float,
-    ) -> _Found:
-        """Evidence for the best of refined candidates."""
-        finest, best = levels[-1], refined[0]
-        T_grids = finest.to_motion(best.pose)
-        scale = 1.0 / finest.resolution_m
-        T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
-        agreement = measure_agreement(WallMap(sides[0]), WallMap(sides[1]), T_cells)
-        shares = [c.score / best.score if best.score > 0.0 else 1.0 for c in refined[1:]]
-        evidence = MatchEvidence(
-            agreement=agreement,
-            score=best.score,
-            surprise=surprise,
-            rival_share=max(shares, default=0.0),
-            slide_share=slide_share(finest, best.pose, _SLIDE_CELLS),
-        )
-        return _Found(refined, tuple(shares), evidence)
-
     def _answer(
-        self, levels: list[GridProblem], outcome: SearchOutcome, found: _Found
+        self, levels: list[GridProblem], outcome: SearchOutcome, found: Found
     ) -> RegistrationResult:
         work, finest = levels[0], levels[-1]
-        pose, agreement = found.refined[0].pose, found.evidence.agreement
+        pose, agreement = found.refined[0].pose, found.evidence.best.agreement
         verdict, reason, probability = decide(found.evidence, self._config)
-        if outcome.is_stopped or (verdict is Verdict.ACCEPTED and not outcome.is_complete):
-            verdict = Verdict.BUDGET_EXHAUSTED
-            reason = (
-                f"stopped after {outcome.num_boxes} boxes with a gap of "
+        if verdict is Verdict.ACCEPTED and not outcome.is_complete:
+            # Evidence decides what is right; the proof, how much better another pose could score.
+            open_gap = (
+                f"the proof stopped after {outcome.num_boxes} boxes with a gap of "
                 f"{1.0 - outcome.lower_bound / max(outcome.upper_bound, 1e-12):.0%}, "
-                f"expected {self._config.gap:.0%}"
+                f"asked were {self._config.gap:.0%}"
             )
+            if self._config.is_proof_required:
+                verdict, reason = Verdict.BUDGET_EXHAUSTED, open_gap
+            else:
+                reason = f"{reason}; {open_gap}"
+        if self._is_cancelled:
+            verdict = Verdict.BUDGET_EXHAUSTED
+            reason = f"cancelled after {outcome.num_boxes} boxes, before the proof was complete"
         motion = self._to_frame(finest.to_motion(pose))
         bound = outcome.upper_bound / max(outcome.lower_bound, 1e-12)
         rivals = tuple(
-            Rival(self._to_frame(finest.to_motion(c.pose)), share, bound)
-            for c, share in zip(found.refined[1:], found.shares, strict=True)
-            if share > _RIVAL_SHARE
+            Rival(self._to_frame(finest.to_motion(c.pose)), rival.share, bound)
+            for c, rival in zip(found.refined[1:], found.evidence.rivals, strict=True)
+            if rival.share > _RIVAL_SHARE or verdict is Verdict.AMBIGUOUS
         )
         source_points = work.source_points + work.center
         return RegistrationResult(
@@ -375,12 +333,11 @@ class _GridMatch:
         self, problem: GridProblem, pose: FloatArray, evidence: MatchEvidence, motion: SE2
     ) -> FloatArray:
         """Covariance of ``T_target_source`` [m, m, rad] from that of the pose."""
-        agreement = evidence.agreement
-        # Bent maps leave larger residuals, and their errors are common to whole walls: on
-        # simulated pairs the variance grows with the fourth power of the residual
-        # .
-        growth = max((agreement.residual_cells / _RESIDUAL_CELLS) ** 4, 0.05)
-        num_pairs = max(agreement.num_walls, 1) / (_CELLS_PER_PAIR * growth)
+        agreement = evidence.best.agreement
+        # Bent maps leave larger residuals, and errors are common to whole walls; exponents and
+        # factor are those that give simulated pairs of all noises a NEES near its expectation.
+        residual_cells = max(agreement.residual_cells, _LEAST_RESIDUAL_CELLS)
+        num_pairs = math.sqrt(max(agreement.num_walls, 1)) / (1.16 * residual_cells**4.5)
         covariance = pose_covariance(
             problem, pose, num_pairs, _FINE_SIGMA_CELLS, evidence.slide_share
         )
@@ -446,45 +403,3 @@ def _too_little(
             f"expected at least {config.min_wall_cells}"
         )
     return None
-
-
-def _climb(problem: GridProblem, poses: FloatArray) -> list[_Candidate]:
-    """Local maxima from poses (K, 3), best first, apart from each other."""
-    climbed = [_Candidate(*problem.ascend(pose)) for pose in poses]
-    climbed.sort(key=lambda c: -c.score)
-    if not climbed:
-        return []
-    stacked = np.array([c.pose for c in climbed])
-    return [climbed[k] for k in distinct(stacked, problem.radius, 4.0, len(climbed))]
-
-
-def _is_inside(window: PoseWindow, pose: FloatArray) -> bool:
-    offset = pose - window.middle
-    offset[0] = wrap_angle(float(offset[0]))
-    return bool((np.abs(offset) <= window.half + 1e-9).all())
-
-
-def _merge_best(
-    problem: GridProblem, candidates: list[_Candidate], outcome: SearchOutcome
-) -> list[_Candidate]:
-    merged = [_Candidate(outcome.pose, outcome.lower_bound), *candidates]
-    stacked = np.array([c.pose for c in merged])
-    return [merged[k] for k in distinct(stacked, problem.radius, 1.0, len(merged))]
-
-
-def _surprise(candidates: list[_Candidate], radius: float) -> float:
-    """How far the best candidate lies above those elsewhere, in their standard deviations.
-
-    The others are the best that chance reaches at other poses of these two maps.
-    """
-    best = candidates[0]
-    others = [
-        c.score
-        for c in candidates[1:]
-        if abs(wrap_angle(float(c.pose[0] - best.pose[0]))) * radius > 4.0
-        or np.hypot(*(c.pose[1:] - best.pose[1:])) > 4.0
-    ]
-    if len(others) < 4:
-        return 0.0
-    spread = max(float(np.std(others)), 0.02 * best.score, 1e-9)
-    return float((best.score - np.mean(others)) / spread)

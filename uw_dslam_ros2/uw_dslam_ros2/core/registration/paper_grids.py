@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.features.clustering import cluster_filter
 from uw_dslam_ros2.core.features.grid_filter import clean_cells, coarsen
 from uw_dslam_ros2.core.features.grid_points import grid_points
+from uw_dslam_ros2.core.features.sampling import sample_voxels, voxel_size
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
 from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
@@ -16,6 +21,10 @@ from uw_dslam_ros2.core.registration.result import PriorWindow, Progress, Regist
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["register_grids_by_points"]
+
+FloatArray = NDArray[np.float64]
+_CANDIDATES_PER_POINT = 4
+_VOXEL_GROWTH = 1.2
 
 
 def register_grids_by_points(
@@ -28,9 +37,13 @@ def register_grids_by_points(
     progress: Callable[[Progress], None] | None = None,
     is_cancelled: Callable[[], bool] | None = None,
 ) -> RegistrationResult:
-    """Match the maps' points alone (Algorithms 1 to 4), and say how the maps agree there."""
+    """Match the maps' points alone (Algorithms 1 to 4), and say how the maps agree there.
+
+    Points are found, freed of those in no cluster, and thinned to one a voxel (Algorithm 2); their
+    number, not the voxels' size, is what `GridRegistrationConfig.max_points` limits.
+    """
     points, weights = zip(
-        *(grid_points(m, config.features, config.max_points) for m in (source, target)),
+        *(_sampled_points(m, config.features, config.max_points) for m in (source, target)),
         strict=True,
     )
     result = register_point_sets(
@@ -58,3 +71,21 @@ def register_grids_by_points(
         walls[0], walls[1], SE2(T_grids.x / resolution_m, T_grids.y / resolution_m, T_grids.yaw)
     )
     return replace(result, overlap=agreement.overlap, conflict_ratio=agreement.conflict)
+
+
+def _sampled_points(
+    occupancy: OccupancyMap, method: str, max_points: int
+) -> tuple[FloatArray, FloatArray]:
+    """Algorithm 2: points (N, 2) [m] and weights (N,) of sum 1, N at most ``max_points``."""
+    points, weights = grid_points(occupancy, method, _CANDIDATES_PER_POINT * max_points)
+    is_clustered = cluster_filter(points)
+    points, weights = points[is_clustered], weights[is_clustered]
+    size_m = voxel_size(points)
+    chosen = np.arange(len(points))
+    while size_m > 0.0:
+        chosen = sample_voxels(points, size_m)
+        if len(chosen) <= max_points:
+            break
+        size_m *= _VOXEL_GROWTH
+    total = float(weights[chosen].sum())
+    return points[chosen], weights[chosen] / total if len(chosen) else weights[chosen]

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence
 from uw_dslam_ros2.core.registration import grid_kernels
+from uw_dslam_ros2.core.registration.grid_lines import off_strongest_lines
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem
+from uw_dslam_ros2.core.registration.signed_field import wall_distance
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["Agreement", "curvature", "measure_agreement", "pose_covariance", "slide_share"]
@@ -24,9 +26,12 @@ class Agreement:
 
     ``overlap`` is the area seen by both over the smaller seen area. Of the wall cells of either
     map inside the other's seen area (``num_walls``), ``agreement`` is the share with a wall near
-    and ``conflict`` the share on free space with none near. ``num_source_inliers`` of
-    ``num_source_walls`` wall cells have a partner. ``residual_cells`` is the root mean square
-    distance of the partners.
+    and ``conflict`` the share on free space with none near. ``inlier_ratio`` of
+    the source's wall cells have a partner. ``residual_cells`` is the root mean square
+    distance of the partners. ``chance`` is the share of the common area that is that near to a
+    wall: what a wall cell dropped anywhere would find. ``num_detail`` of the agreeing wall cells
+    lie off the few straight lines that hold most of them: any room has straight walls, so they
+    tell one place from another.
     """
 
     overlap: float
@@ -35,6 +40,8 @@ class Agreement:
     conflict: float
     inlier_ratio: float
     residual_cells: float
+    chance: float
+    num_detail: float
 
 
 class WallMap:
@@ -43,9 +50,7 @@ class WallMap:
     def __init__(self, cells: CellEvidence) -> None:
         self.cells = cells
         is_wall = cells.wall > 0.25
-        self.distance = cv2.distanceTransform(
-            (~is_wall).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
-        )
+        self.distance = wall_distance(cells)
         self.free = cv2.boxFilter(cells.free, -1, (3, 3), borderType=cv2.BORDER_CONSTANT)
         self.known = cells.known > 0.5
         rows, cols = np.nonzero(is_wall)
@@ -62,6 +67,10 @@ class WallMap:
         return known, self.distance[row, col].astype(np.float64), self.free[row, col]
 
 
+_NUM_LINES = 4
+_NUM_LINE_ANGLES = 120
+_LINE_HALF_WIDTH_CELLS = 2.5
+_MOST_LINE_POINTS = 1500
 _NEAR_CELLS = 2.5
 _FAR_CELLS = 3.5
 _FREE_SLIDE_SHARE = 0.85  # as good as free: the pose may be anywhere along the map
@@ -70,6 +79,7 @@ _FREE_SLIDE_SHARE = 0.85  # as good as free: the pose may be anywhere along the 
 def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreement:
     """Agreement of two maps of one resolution; ``T_cells`` maps source to target cells [x, y]."""
     seen, near, conflict, square, inliers = 0, 0, 0, 0.0, 0.0
+    agreeing = []
     for walls, other, motion in ((source, target, T_cells), (target, source, T_cells.inverse())):
         known, distance, free = other.at(motion.apply(walls.points))
         is_near = known & (distance <= _NEAR_CELLS)
@@ -77,28 +87,47 @@ def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreeme
         near += int(is_near.sum())
         square += float((distance[is_near] ** 2).sum())
         conflict += int((known & (distance > _FAR_CELLS) & (free > 0.6)).sum())
+        points = walls.points[is_near]
+        agreeing.append(T_cells.apply(points) if walls is source else points)
         if walls is source:
             inliers = float(is_near.mean()) if len(is_near) else 0.0
+    overlap, chance = _common_area(source, target, T_cells)
     return Agreement(
-        _overlap(source, target, T_cells),
+        overlap,
         seen,
         near / max(seen, 1),
         conflict / max(seen, 1),
         inliers,
         float(np.sqrt(square / max(near, 1))),
+        chance,
+        near * _detail_share(np.concatenate(agreeing)),
     )
 
 
-def _overlap(source: WallMap, target: WallMap, T_cells: SE2) -> float:
+def _detail_share(points: FloatArray) -> float:
+    """Share of points (N, 2) [cells] that lie off the few lines that hold most of them."""
+    if len(points) == 0:
+        return 0.0
+    some = points[:: -(-len(points) // _MOST_LINE_POINTS)]
+    is_left = off_strongest_lines(
+        np.ascontiguousarray(some), _NUM_LINES, _NUM_LINE_ANGLES, _LINE_HALF_WIDTH_CELLS
+    )
+    return float(is_left.mean())
+
+
+def _common_area(source: WallMap, target: WallMap, T_cells: SE2) -> tuple[float, float]:
+    """Area seen by both over the smaller seen area, and the share of it that is near a wall."""
     rows, cols = target.known.shape
     matrix = T_cells.matrix()[:2].copy()
     matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts from cell centres
-    moved = cv2.warpAffine(
-        source.known.astype(np.uint8), matrix, (cols, rows), flags=cv2.INTER_NEAREST
-    )
-    both = int((target.known & (moved > 0)).sum())
+    # 0 unknown, 1 known, 2 known and near a wall
+    image = source.known * (1 + (source.distance <= _NEAR_CELLS)).astype(np.uint8)
+    moved = cv2.warpAffine(image, matrix, (cols, rows), flags=cv2.INTER_NEAREST)
+    both = target.known & (moved > 0)
+    num_both = int(both.sum())
     smaller = min(int(source.known.sum()), int(target.known.sum()))
-    return min(both / max(smaller, 1), 1.0)
+    near = int((both & (moved > 1)).sum()) + int((both & (target.distance <= _NEAR_CELLS)).sum())
+    return min(num_both / max(smaller, 1), 1.0), 0.5 * near / max(num_both, 1)
 
 
 def curvature(problem: GridProblem, pose: FloatArray) -> FloatArray:

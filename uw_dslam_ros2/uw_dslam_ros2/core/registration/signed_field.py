@@ -19,6 +19,7 @@ __all__ = [
     "refined",
     "signed_field",
     "value_tables",
+    "wall_distance",
 ]
 
 FloatGrid = NDArray[np.float32]
@@ -36,23 +37,33 @@ class SignedField:
     coefficients: FloatGrid
 
 
+def wall_distance(cells: CellEvidence) -> FloatGrid:
+    """Distance (R, C) from cells to the nearest wall, in cells; infinite without any wall."""
+    is_wall = cells.wall > 0.25
+    if not is_wall.any():
+        return np.full(cells.shape, np.inf, np.float32)
+    distance: FloatGrid = cv2.distanceTransform(
+        (~is_wall).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+    )
+    return distance
+
+
 def signed_field(
-    cells: CellEvidence, sigma_cells: float, free_penalty: float, stride: int = 1
+    cells: CellEvidence,
+    sigma_cells: float,
+    free_penalty: float,
+    stride: int = 1,
+    distance: FloatGrid | None = None,
 ) -> SignedField:
     """Field of a map's cells, on a lattice ``stride`` times coarser.
 
     A wall is worth exp(-d^2 / (2 sigma^2)) at distance d, free space -``free_penalty`` times its
     share of the neighbourhood, less as a wall comes near. ``sigma_cells`` is in cells of
-    ``cells``.
+    ``cells``; ``distance`` is `wall_distance` where it is known already.
     """
-    is_wall = cells.wall > 0.25
-    if is_wall.any():
-        distance = cv2.distanceTransform(
-            (~is_wall).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
-        )
-        near = np.exp(distance**2 * np.float32(-0.5 / sigma_cells**2))
-    else:
-        near = np.zeros(cells.shape, np.float32)
+    if distance is None:
+        distance = wall_distance(cells)
+    near = np.exp(np.square(distance) * np.float32(-0.5 / sigma_cells**2))
     free = cv2.boxFilter(cells.free, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
     field = near - np.float32(free_penalty) * free * (np.float32(1.0) - near)
     # Nothing is known beyond the edge of a map, not even that a wall's kernel reaches there.

@@ -3,67 +3,137 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.refine_grids import Agreement
 from uw_dslam_ros2.core.registration.result import Verdict
 
-__all__ = ["FEATURE_NAMES", "MatchEvidence", "decide", "evidence_features", "probability_of"]
+__all__ = [
+    "MATCH_FEATURES",
+    "MODELS",
+    "POSE_FEATURES",
+    "MatchEvidence",
+    "PoseEvidence",
+    "VerdictModels",
+    "decide",
+    "match_features",
+    "pose_features",
+    "probability_of",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEvidence:
+    """What is known about one pose of two maps.
+
+    ``share`` is its score over the best pose's, ``surprise`` how far the score lies above what
+    chance alignments of these two maps reach, in standard deviations of such.
+    """
+
+    agreement: Agreement
+    share: float
+    surprise: float
 
 
 @dataclass(frozen=True, slots=True)
 class MatchEvidence:
-    """What is known about the best pose of two maps.
+    """What is known about the best pose of two maps, and about its rivals.
 
-    ``surprise`` is how far the best score lies above what chance alignments of these two maps
-    reach, in standard deviations of such. ``rival_share`` is the best other pose's score after
-    refinement over the best one's. ``slide_share`` is the score some cells off in
-    the least curved direction over the best one.
+    ``slide_share`` is the score some cells off in the least curved direction over the best one.
+    ``log_volume`` is the logarithm of the number of poses that were searched: the more there are,
+    the better the best of them is by chance.
     """
 
-    agreement: Agreement
-    score: float
-    surprise: float
-    rival_share: float
+    best: PoseEvidence
+    rivals: tuple[PoseEvidence, ...]
     slide_share: float
+    log_volume: float
+
+    @property
+    def rival_share(self) -> float:
+        """Score of the best rival over the best pose's."""
+        return max((rival.share for rival in self.rivals), default=0.0)
 
 
-# More walls than these are no more proof: chance matches of large maps have them too.
-_ENOUGH_WALLS = 600.0
+# More detail than this is no more proof: chance matches of large maps have it too.
+_ENOUGH_DETAIL = 600.0
+_LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
 
-FEATURE_NAMES = ("agreement", "conflict", "log_agreeing", "log_surprise", "rival_share", "overlap")
+POSE_FEATURES = (
+    "agreement",
+    "conflict",
+    "log_detail",
+    "chance",
+    "log_surprise",
+    "log_volume",
+)
+MATCH_FEATURES = ("pose", "rival")
+_MOST_LOGIT = 12.0
 
-# Logistic model: intercept, then one coefficient for each of `FEATURE_NAMES`; fitted by
-# `study verdict --seeds 2` on 127 simulated pairs, ridge 0.1.
-_COEFFICIENTS = (-15.0730, 5.3186, -5.7241, 2.0610, 1.3574, -3.7250, 0.8713)
+
+@dataclass(frozen=True, slots=True)
+class VerdictModels:
+    """Logistic models, intercept first: of a pose for itself, and of the best among rivals."""
+
+    pose: tuple[float, ...]
+    match: tuple[float, ...]
 
 
-def evidence_features(evidence: MatchEvidence) -> tuple[float, ...]:
-    """Quantities of which the probability is made, as `FEATURE_NAMES`."""
-    agreement = evidence.agreement
+MODELS = VerdictModels(
+    pose=(-2.04, 6.79, -12.91, 0.83, -6.71, 0.27, -0.24),
+    match=(0.19, 0.89, -0.99),
+)
+"""Fitted by `study verdict` with its default settings, which prints them."""
+
+
+def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
+    """Quantities that speak for or against a pose by itself, as `POSE_FEATURES`."""
+    agreement = pose.agreement
     return (
         agreement.agreement,
         agreement.conflict,
-        math.log1p(min(agreement.agreement * agreement.num_walls, _ENOUGH_WALLS)),
-        math.log(min(max(evidence.surprise, 0.5), 30.0)),
-        evidence.rival_share,
-        agreement.overlap,
+        math.log1p(min(agreement.num_detail, _ENOUGH_DETAIL)),
+        agreement.chance,
+        math.log(min(max(pose.surprise, 0.5), 30.0)),
+        log_volume,
     )
 
 
-def probability_of(evidence: MatchEvidence) -> float:
-    """Probability in [0, 1] that the best pose is right, of a model fitted on simulated pairs."""
-    logit = _COEFFICIENTS[0] + sum(
-        c * x for c, x in zip(_COEFFICIENTS[1:], evidence_features(evidence), strict=True)
+def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tuple[float, ...]:
+    """Logit of the best pose for itself, and how convincing its strongest rival is, from 0 up."""
+    best, *rivals = (
+        _logit(pose_model, pose_features(pose, evidence.log_volume))
+        for pose in (evidence.best, *evidence.rivals)
     )
-    return 1.0 / (1.0 + math.exp(-max(min(logit, 50.0), -50.0)))
+    return best, math.log1p(math.exp(max(rivals))) if rivals else 0.0
 
 
-def decide(evidence: MatchEvidence, config: GridRegistrationConfig) -> tuple[Verdict, str, float]:
+def probability_of(
+    evidence: MatchEvidence, models: VerdictModels = MODELS, *, is_alone: bool = False
+) -> float:
+    """Probability in [0, 1] that the best pose is right, of models fitted on simulated pairs.
+
+    ``is_alone`` leaves the rivals out.
+    """
+    if is_alone:
+        evidence = replace(evidence, rivals=())
+    logit = _logit(models.match, match_features(evidence, models.pose))
+    return 1.0 / (1.0 + math.exp(-logit))
+
+
+def _logit(model: Sequence[float], features: Sequence[float]) -> float:
+    logit = model[0] + sum(c * x for c, x in zip(model[1:], features, strict=True))
+    return max(-_MOST_LOGIT, min(_MOST_LOGIT, logit))
+
+
+def decide(
+    evidence: MatchEvidence, config: GridRegistrationConfig, models: VerdictModels = MODELS
+) -> tuple[Verdict, str, float]:
     """Verdict, its reason with the numbers that decided, and the pose's probability."""
-    probability = probability_of(evidence)
-    agreement = evidence.agreement
+    probability = probability_of(evidence, models)
+    agreement = evidence.best.agreement
     if evidence.slide_share > config.max_slide_share:
         reason = (
             f"the walls leave one direction free, as a straight wall does: the score is still "
@@ -85,19 +155,40 @@ def decide(evidence: MatchEvidence, config: GridRegistrationConfig) -> tuple[Ver
         )
         return Verdict.CONTRADICTED, reason, probability
     # Rivals only matter to an alignment that would be convincing without them.
-    alone = probability_of(replace(evidence, rival_share=min(evidence.rival_share, 0.5)))
-    if evidence.rival_share > config.max_rival_share and alone >= config.min_probability:
+    alone = probability_of(evidence, models, is_alone=True)
+    is_rivalled = evidence.rival_share > config.max_rival_share or not is_probable
+    if is_rivalled and alone >= config.min_probability:
         reason = (
-            f"another pose reaches {evidence.rival_share:.0%} of the best score, "
-            f"expected at most {config.max_rival_share:.0%}"
+            f"another pose reaches {evidence.rival_share:.0%} of the best score and agrees as "
+            f"well where it overlaps: right with probability {probability:.2f} only"
         )
         return Verdict.AMBIGUOUS, reason, min(probability, 0.5)
     numbers = (
         f"{agreement.agreement:.0%} of the common walls agree, {agreement.conflict:.0%} conflict, "
         f"overlap {agreement.overlap:.0%}, best rival {evidence.rival_share:.0%}, "
-        f"score {evidence.surprise:.1f} deviations above chance"
+        f"score {evidence.best.surprise:.1f} deviations above chance"
     )
+    if not is_probable and _is_plain(evidence, config, models):
+        reason = (
+            f"what agrees are a few straight walls, as many places have them: right with "
+            f"probability {probability:.2f} only; {agreement.num_detail:.0f} cells of detail, "
+            + numbers
+        )
+        return Verdict.AMBIGUOUS, reason, probability
     if not is_probable:
         reason = f"right with probability {probability:.2f} only: {numbers}"
         return Verdict.NOT_ENOUGH_OVERLAP, reason, probability
     return Verdict.ACCEPTED, numbers, probability
+
+
+def _is_plain(
+    evidence: MatchEvidence, config: GridRegistrationConfig, models: VerdictModels
+) -> bool:
+    """Whether the maps agree so well that with more detail the match would be accepted."""
+    agreement = evidence.best.agreement
+    detailed = replace(agreement, num_detail=max(agreement.num_detail, _ENOUGH_DETAIL))
+    richer = replace(evidence, best=replace(evidence.best, agreement=detailed))
+    return (
+        agreement.agreement >= _LIKE_SHARE
+        and probability_of(richer, models) >= config.min_probability
+    )
