@@ -12,6 +12,7 @@ from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 from places import room_submap
 from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 from uw_dslam_msgs.msg import MergeStatus, SubmapInfo
 from uw_dslam_msgs.msg import Submap as SubmapMsg
@@ -29,6 +30,7 @@ from visualization_msgs.msg import MarkerArray
 
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.provenance import read_provenance
 from uw_dslam_ros2.ros.conversions import occupancy_from_msg, submap_to_msg
 from uw_dslam_ros2.ros.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.qos import LATCHED, SUBMAPS
@@ -308,6 +310,42 @@ def test_session_parameter_resumes_by_itself(manage, tmp_path):
         until(lambda: probe.num_merged == 1, "the submap")
     with manage(has_server=False, session=folder, **FAST) as (until, probe, _):
         until(lambda: probe.num_merged == 1, "the resumed session")
+
+
+def test_what_is_left_is_asked_when_told_to_settle(manage):
+    """While more is expected a refused pair is left alone; then it is asked as a whole."""
+    asked = []
+
+    def refuse_at_first(request, response):
+        asked.append(request.options.max_seconds)
+        response.result = RegisterMaps.Response.DONE
+        response.registration.verdict = response.registration.AMBIGUOUS
+        response.registration.reason = "for now"
+        return response
+
+    with manage(has_server=False, quiet_s=3600.0, **FAST) as (until, probe, call):
+        probe.node.create_service(RegisterMaps, "/some/register_maps", refuse_at_first)
+        for submap in two_submaps():
+            probe.send(submap)
+        until(lambda: len(asked) == 1, "the first question")
+        probe.send(room_submap("auv_2", 1, T_room_submap=T_ROOM["auv_2"]))
+        until(lambda: ("auv_2", 1) in probe.states(), "the larger map")
+        assert len(asked) == 1
+        assert call(Trigger, "settle").success
+        until(lambda: len(asked) >= 2, "the rest")
+    # No machine is so slow that a search within its budget of boxes takes this long.
+    assert min(asked) >= 60.0
+
+
+def test_provenance_is_saved_with_the_map(manage, tmp_path):
+    with manage(has_server=False, **FAST) as (until, probe, call):
+        probe.send(room_submap("auv_1"))
+        until(lambda: probe.num_merged == 1, "the submap")
+        saved = call(SaveMap, "save_map", path=str(tmp_path / "map"))
+    archive = str(tmp_path / "map_provenance.npz")
+    assert archive in saved.files
+    provenance = read_provenance(archive)
+    assert provenance.contributors == ((), (("auv_1", 0),))
 
 
 def test_changed_part_goes_out_as_an_update(manage):

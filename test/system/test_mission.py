@@ -61,6 +61,7 @@ SERVICES = {
     "/map_queue_manager/restore_submap": "uw_dslam_msgs/srv/RestoreSubmap",
     "/map_queue_manager/save_session": "uw_dslam_msgs/srv/SaveSession",
     "/map_queue_manager/load_session": "uw_dslam_msgs/srv/LoadSession",
+    "/map_queue_manager/settle": "std_srvs/srv/Trigger",
     "/auv_1/sonar_mapper/finish": "std_srvs/srv/Trigger",
 }
 ACTION = ("/registration_server/register_maps", "uw_dslam_msgs/action/RegisterMaps")
