@@ -229,8 +229,9 @@ class _Match:
             turned, self._target.points, self._evidence.target_outline, np.array([x, y]),
             max(best.sigma_m, _INDEPENDENT * self._spacing_m), _CONTRAST,
         )  # fmt: skip
-        if repetition > self._evidence.repetition:
-            self._evidence = replace(self._evidence, repetition=repetition)
+        if repetition <= self._evidence.repetition:
+            return candidates
+        self._evidence = replace(self._evidence, repetition=repetition)
         return self._distinct((self._evidence.of(r), r) for _, r in candidates)
 
     def _settings(self, max_boxes: int) -> SearchSettings:
@@ -318,9 +319,9 @@ class _Match:
         found = []
         for pose in poses:
             start = np.array(pose, dtype=np.float64)
-            refinement = refine(self._model, self._evidence, start, sigma_m)
-            if not self._is_outside(refinement.pose()):
-                found.append((self._evidence.of(refinement), refinement))
+            candidate = refine(self._model, self._evidence, start, sigma_m)
+            if not self._is_outside(candidate[1].pose()):
+                found.append(candidate)
         return found
 
     def _is_decisive(self, found: list[Candidate]) -> bool:

@@ -25,6 +25,8 @@ class Outline:
 
     corners: FloatArray  # (k, 2), counter-clockwise
     area_m2: float
+    normals: FloatArray  # (k, 2), inward, of the side that begins at each corner
+    offsets: FloatArray  # (k,): a point is inside where it lies as far along all normals
 
     @classmethod
     def of(cls, points: FloatArray) -> Outline:
@@ -40,7 +42,7 @@ class Outline:
         middle = corners.mean(axis=0)
         # The share of the region that the hull leaves out is, on average, that of the corners.
         growth = math.sqrt(1.0 / (1.0 - min(len(corners) / (count + 1.0), 0.75)))
-        outline = cls(middle + growth * (corners - middle), hull.volume * growth**2)
+        outline = cls._around(middle + growth * (corners - middle), hull.volume * growth**2)
         box = cls._box(points)
         return outline if outline.area_m2 > box.area_m2 / count else box
 
@@ -57,14 +59,20 @@ class Outline:
         corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes.T
         if np.linalg.det(axes) < 0.0:
             corners = corners[::-1]
-        return cls(middle + corners, float(width.prod()))
+        return cls._around(middle + corners, float(width.prod()))
+
+    @classmethod
+    def _around(cls, corners: FloatArray, area_m2: float) -> Outline:
+        along = np.roll(corners, -1, axis=0) - corners
+        normals = np.column_stack([-along[:, 1], along[:, 0]])
+        offsets = (normals * corners).sum(axis=1)
+        # What lies on a side is inside, rounding or not.
+        slack = 1e-9 * np.abs(normals).sum(axis=1) * np.ptp(corners, axis=0).max()
+        return cls(corners, area_m2, normals, offsets - slack)
 
     def holds(self, points: FloatArray) -> NDArray[np.bool_]:
         """Mask (N,) of the points (N, 2) inside."""
-        along = np.roll(self.corners, -1, axis=0) - self.corners
-        normals = np.column_stack([-along[:, 1], along[:, 0]])
-        offsets = (normals * self.corners).sum(axis=1)
-        return np.asarray((points @ normals.T >= offsets).all(axis=1))
+        return np.asarray((points @ self.normals.T >= self.offsets).all(axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

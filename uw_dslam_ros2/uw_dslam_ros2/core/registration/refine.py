@@ -69,12 +69,12 @@ def refine(
     parameters: FloatArray,
     sigma_m: float,
     num_halvings: int = 1,
-) -> Refinement:
+) -> tuple[float, Refinement]:
     """Climb the likelihood in pose, noise and number of pairs from a start (theta, x, y).
 
     A wide kernel among clutter is a local optimum of its own, so the noise is also capped at half,
     a quarter and so on of `sigma_m` in turn, each from where the last one ended; the one with the
-    highest evidence wins.
+    highest evidence wins. Returns that evidence, and where it was found.
     """
     num_pairs = _START_SHARE * min(len(model.source), len(model.target))
     last = best = _climb(model, parameters, sigma_m, num_pairs, model.max_sigma_m, 25)
@@ -89,7 +89,7 @@ def refine(
         found = evidence.of(last)
         if found > best_evidence:
             best, best_evidence = last, found
-    return best
+    return best_evidence, best
 
 
 def polish(model: PointModel, refinement: Refinement) -> Refinement:
