@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from unit.cli import missions
 
-from uw_dslam_ros2.cli import pictures
+from uw_dslam_ros2.cli import map_drawing, pictures
 from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
 from uw_dslam_ros2.cli.scoring import Scores, Truth, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
@@ -113,8 +113,8 @@ def test_a_thin_wall_survives_the_reduction() -> None:
     values = np.zeros((8, num_cells), dtype=np.int8)
     values[:, 1001] = 100
     occupancy = OccupancyMap(GridSpec(0.05, 8, num_cells), values)
-    figure, axes = pictures._single(occupancy.spec)
-    pictures._show_map(axes, occupancy)
+    figure, axes = map_drawing.single_map(occupancy.spec)
+    map_drawing.show_map(axes, occupancy)
     shown = np.asarray(axes.images[0].get_array())
     assert shown.shape[1] <= 1600
     assert (shown.sum(axis=2) < 0.2 * 3 * 255).any(axis=1).all()
@@ -124,8 +124,8 @@ def test_a_thin_wall_survives_the_reduction() -> None:
 def test_a_rotated_map_is_drawn_where_it_lies() -> None:
     values = np.zeros((10, 30), dtype=np.int8)
     spec = GridSpec(1.0, 10, 30, SE2(5.0, 0.0, np.pi / 2))
-    _, axes = pictures._single(spec)
-    pictures._show_map(axes, OccupancyMap(spec, values))
+    _, axes = map_drawing.single_map(spec)
+    map_drawing.show_map(axes, OccupancyMap(spec, values))
     assert axes.get_xlim() == pytest.approx((-5.0, 5.0))
     assert axes.get_ylim() == pytest.approx((0.0, 30.0))
 
