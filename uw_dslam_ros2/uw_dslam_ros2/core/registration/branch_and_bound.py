@@ -187,6 +187,7 @@ class _Search:
         self._heap = np.arange(slots, dtype=np.int32)
         self._counters = np.zeros(5, dtype=np.int64)
         self._found = np.full((_MAX_OPTIMA, 5), -math.inf)
+        self._worth = np.ones(32)  # of the bound by curvature, by size of a box
         value, _, _ = problem.value_at(problem.window[:3])
         self._best = np.array([value, *problem.window[:3], 0.0, -math.inf])
         self._boxes[0, :6] = problem.window
@@ -254,6 +255,7 @@ class _Search:
             p.coefficients, p.bounds, p.windows, p.curvatures, p.window,
             p.arm, p.reach, p.margin, p.small, settings.gap, settings.keep, apart, max_boxes,
             self._boxes, self._keys, self._heap, self._counters, self._best, self._found,
+            self._worth,
         )  # fmt: skip
 
     def _grow(self) -> bool:

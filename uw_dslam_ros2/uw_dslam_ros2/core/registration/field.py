@@ -18,17 +18,17 @@ to it everywhere.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import correlate1d
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration import field_kernels
 
-__all__ = ["Field", "field_from_samples", "likelihood_field", "mixture_field"]
+__all__ = ["FIRST_LEVEL", "Field", "field_from_samples", "likelihood_field", "mixture_field"]
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -36,7 +36,9 @@ IntArray = NDArray[np.int64]
 
 _BORDER = 3  # zero coefficients around the content, so that the spline itself ends at zero
 _TAIL_SIGMAS = 6.0
+_BINS = 10  # on either side of a centre; beyond, a Gaussian is next to nothing
 _NUM_WINDOWS = 6  # exact maxima up to 63 cells; beyond, windows that are a little too large
+FIRST_LEVEL = _NUM_WINDOWS  # of the pyramid, in powers of two
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,10 +54,10 @@ class Field:
     pitch_m: float
     coefficients: Float32Array  # (R, C)
     error: float  # proven bound of |spline - its formula|; 0 where the spline is the definition
-    bounds: Float32Array  # flat, all levels of the maximum pyramid
+    bounds: Float32Array  # flat, the maximum pyramid from 64 x 64 cells on
     windows: Float32Array  # (6, R, C): largest value in 2^k x 2^k cells from each cell on
     curvatures: Float32Array  # (6, R, C): largest second derivative [1 / m^2] in 2^k x 2^k cells
-    levels: IntArray  # (L, 3): offset, number of columns, right-shift of a cell index
+    levels: IntArray  # (L, 3): offset, number of columns, right-shift of a cell index, from 64 on
 
     @property
     def maximum(self) -> float:
@@ -83,8 +85,11 @@ class Field:
         cells = self._cells(low, high)
         if cells is None:
             return 0.0
+        value = _largest(self.windows, *cells)
+        if value is not None:
+            return value
         col, row, last_col, last_row = cells
-        for level, (offset, num_cols, shift) in enumerate(self.levels):
+        for level, (offset, num_cols, shift) in enumerate(self.levels, FIRST_LEVEL):
             if max(last_col - col, last_row - row) <= (1 << level) - (1 << shift):
                 return float(self.bounds[offset + (row >> shift) * num_cols + (col >> shift)])
         return math.inf
@@ -97,14 +102,8 @@ class Field:
         cells = self._cells(low, high)
         if cells is None:
             return 0.0
-        col, row, last_col, last_row = cells
-        spans = window_spans()
-        span = max(last_col - col, last_row - row)
-        if span >= len(spans):
-            return math.inf
-        table, size = self.curvatures[spans[span]], 1 << int(spans[span])
-        rows, cols = [row, max(row, last_row - size + 1)], [col, max(col, last_col - size + 1)]
-        return float(table[np.ix_(rows, cols)].max())
+        value = _largest(self.curvatures, *cells)
+        return math.inf if value is None else value
 
     def _cells(self, low: ArrayLike, high: ArrayLike) -> tuple[int, int, int, int] | None:
         """First column and row, last column and row that a rectangle touches."""
@@ -116,6 +115,19 @@ class Field:
         first = np.maximum(first, 0)
         last = np.minimum(last, [num_cols - 1, num_rows - 1])
         return int(first[0]), int(first[1]), int(last[0]), int(last[1])
+
+
+def _largest(
+    windows: Float32Array, col: int, row: int, last_col: int, last_row: int
+) -> float | None:
+    """Largest value in a rectangle of cells, None where that is larger than the windows go."""
+    span = max(last_col - col, last_row - row)
+    spans = window_spans()
+    if span >= len(spans):
+        return None
+    size = 1 << int(spans[span])
+    rows, cols = [row, max(row, last_row - size + 1)], [col, max(col, last_col - size + 1)]
+    return float(windows[spans[span]][np.ix_(rows, cols)].max())
 
 
 def field_from_samples(
@@ -249,19 +261,30 @@ def _mixture_error(
     if ratio > 1.0:
         # Too coarse for Taylor: no coefficient, and no value, exceeds 1.25 along an axis.
         return 1.5625 * float(weights.sum())
-    distance = np.maximum(np.abs(np.arange(-10, 11)) - 1.0, 0.0)
-    gauss = np.exp(-0.5 * distance**2)
-    nearest = np.maximum(distance - 2.5 * ratio, 0.0)
-    third, fourth = _largest_derivatives(nearest)
-    miss = third * math.sqrt(3.0) / 216.0 * ratio**3 + fourth * 0.0293 * ratio**4
+    miss, gauss = _misses(round(ratio * 1e9) / 1e9 + 1e-9)
     bins = np.floor((centers - centers.min(axis=0)) / sigma_m).astype(np.int64)
     counts = np.zeros(bins.max(axis=0) + 1)
     np.add.at(counts, (bins[:, 0], bins[:, 1]), weights)
-    along = [
-        correlate1d(correlate1d(counts, a, 0, mode="constant"), b, 1, mode="constant")
-        for a, b in ((miss, gauss), (gauss, miss), (miss, miss))
-    ]
-    return float(sum(along).max()) + 4e-8 * float(weights.sum())
+    smeared = _smeared(counts, np.stack([miss, gauss]))
+    both = _smeared(smeared[0].T, (miss + gauss)[None]) + _smeared(smeared[1].T, miss[None])
+    return float(both.max()) + 4e-8 * float(weights.sum())
+
+
+@functools.lru_cache(maxsize=64)
+def _misses(ratio: float) -> tuple[FloatArray, FloatArray]:
+    """By bins of distance to a centre (21,): largest miss along an axis, and largest value."""
+    distance = np.maximum(np.abs(np.arange(-_BINS, _BINS + 1)) - 1.0, 0.0)
+    nearest = np.maximum(distance - 2.5 * ratio, 0.0)
+    third, fourth = _largest_derivatives(nearest)
+    miss = third * math.sqrt(3.0) / 216.0 * ratio**3 + fourth * 0.0293 * ratio**4
+    return miss, np.exp(-0.5 * distance**2)
+
+
+def _smeared(counts: FloatArray, shares: FloatArray) -> FloatArray:
+    """Every bin adds its count, times shares (S, 21), to those ten rows up and down: (S, ...)."""
+    padded = np.pad(counts, ((2 * _BINS, 2 * _BINS), (0, 0)))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BINS + 1, axis=0)
+    return np.moveaxis(windows @ shares.T, 2, 0)
 
 
 def _largest_derivatives(distance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -278,9 +301,9 @@ def _with_tables(
 ) -> Field:
     num_rows, num_cols = coefficients.shape
     levels = []
-    offset, level = 0, 0
+    offset, level = 0, FIRST_LEVEL
     while True:
-        shift = max(0, level - 2)
+        shift = level - 2
         rows, cols = ((num_rows - 1) >> shift) + 1, ((num_cols - 1) >> shift) + 1
         levels.append((offset, cols, shift))
         offset += rows * cols
@@ -291,11 +314,10 @@ def _with_tables(
     bounds = np.empty(offset, dtype=np.float32)
     windows = np.empty((_NUM_WINDOWS, num_rows, num_cols), dtype=np.float32)
     curvatures = np.empty((_NUM_WINDOWS, num_rows, num_cols), dtype=np.float32)
-    field_kernels.fill_first_level(coefficients, 1.0 / pitch_m**2, bounds, curvatures[0].ravel())
-    field_kernels.fill_pyramid(bounds, table, len(table), num_rows)
-    windows[0] = bounds[: windows[0].size].reshape(windows[0].shape)
+    field_kernels.fill_first_level(coefficients, 1.0 / pitch_m**2, windows[0], curvatures[0])
     field_kernels.fill_windows(windows)
     field_kernels.fill_windows(curvatures)
+    field_kernels.fill_pyramid(windows[-1], bounds, table)
     return Field(
         np.asarray(origin, dtype=np.float64),
         pitch_m,

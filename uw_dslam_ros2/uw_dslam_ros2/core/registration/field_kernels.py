@@ -36,14 +36,13 @@ def spline_values(coefficients, nodes):
 def gaussian_samples(center, sigma, first, count, is_interpolated, out):
     """Samples of one axis, or the coefficients of the spline that follows them."""
     scale = -0.5 / (sigma * sigma)
+    d = first - center
+    before, value = math.exp(scale * (d - 1.0) ** 2), math.exp(scale * d * d)
     for k in range(count):
-        d = first + k - center
-        value = math.exp(scale * d * d)
-        if is_interpolated:
-            value = 1.25 * value - 0.125 * (
-                math.exp(scale * (d - 1.0) ** 2) + math.exp(scale * (d + 1.0) ** 2)
-            )
-        out[k] = value
+        d = first + k + 1 - center
+        after = math.exp(scale * d * d)
+        out[k] = 1.25 * value - 0.125 * (before + after) if is_interpolated else value
+        before, value = value, after
 
 
 @njit(cache=True, nogil=True)
@@ -64,9 +63,9 @@ def add_gaussians(grid, centers, weights, sigmas, tail_sigmas, is_interpolated):
         gaussian_samples(centers[j, 1], sigmas[j], first_y, count_y, is_interpolated, along_y)
         for row in range(count_y):
             factor = weights[j] * along_y[row]
-            line = grid[first_y + row]
+            line = grid[first_y + row, first_x : first_x + max(count_x, 0)]
             for col in range(count_x):
-                line[first_x + col] += factor * along_x[col]
+                line[col] += factor * along_x[col]
 
 
 @njit(cache=True, nogil=True)
@@ -77,8 +76,8 @@ def fill_first_level(coefficients, scale, bounds, curvatures):
     for row in range(num_rows):
         for col in range(num_cols):
             if row == 0 or col == 0 or row == num_rows - 1 or col == num_cols - 1:
-                bounds[row * num_cols + col] = 0.0
-                curvatures[row * num_cols + col] = 0.0
+                bounds[row, col] = 0.0
+                curvatures[row, col] = 0.0
                 continue
             c = np.float64(coefficients[row, col])
             n, s = np.float64(coefficients[row + 1, col]), np.float64(coefficients[row - 1, col])
@@ -95,7 +94,7 @@ def fill_first_level(coefficients, scale, bounds, curvatures):
             best = max(
                 best, 0.25 * (c + max(max(n + e + ne, n + w + nw), max(s + e + se, s + w + sw)))
             )
-            bounds[row * num_cols + col] = np.float32(best + abs(best) * 2.0**-20)
+            bounds[row, col] = np.float32(best + abs(best) * 2.0**-20)
             xx, xx_n, xx_s = e - 2.0 * c + w, ne - 2.0 * n + nw, se - 2.0 * s + sw
             yy, yy_e, yy_w = n - 2.0 * c + s, ne - 2.0 * e + se, nw - 2.0 * w + sw
             fxx = max(xx, max(0.5 * (xx + xx_n), 0.5 * (xx + xx_s)))
@@ -107,38 +106,32 @@ def fill_first_level(coefficients, scale, bounds, curvatures):
             half = 0.5 * (fxx - fyy)
             largest = scale * (0.5 * (fxx + fyy) + math.sqrt(half * half + fxy * fxy))
             slack = scale * (abs(c) + abs(n) + abs(s) + abs(e) + abs(w)) * 2.0**-45
-            curvatures[row * num_cols + col] = np.float32(
-                largest + abs(largest) * (up - 1.0) + slack
-            )
+            curvatures[row, col] = np.float32(largest + abs(largest) * (up - 1.0) + slack)
 
 
 @njit(cache=True, nogil=True)
-def fill_pyramid(table, levels, num_levels, num_rows):
-    """Each window is the union of four half as wide, one level below."""
-    for level in range(1, num_levels):
-        shift, below_shift = levels[level, 2], levels[level - 1, 2]
-        offset, cols = levels[level, 0], levels[level, 1]
-        below, below_cols = levels[level - 1, 0], levels[level - 1, 1]
+def fill_pyramid(window, table, levels):
+    """Each window is the union of four half as wide, one level below; the first of ``window``s."""
+    num_rows, num_cols = window.shape
+    below_shift, half = 0, 1 << (levels[0, 2] + 1)
+    below = window.ravel()
+    below_rows, below_cols = num_rows, num_cols
+    for level in range(levels.shape[0]):
+        offset, cols, shift = levels[level, 0], levels[level, 1], levels[level, 2]
         rows = ((num_rows - 1) >> shift) + 1
-        below_rows = ((num_rows - 1) >> below_shift) + 1
-        step = 1 << (shift - below_shift)
-        half = (1 << (level - 1)) >> below_shift
+        step, ahead = 1 << (shift - below_shift), half >> below_shift
         for row in range(rows):
             top = row * step
-            bottom = min(top + half, below_rows - 1)
+            bottom = min(top + ahead, below_rows - 1)
             for col in range(cols):
                 left = col * step
-                right = min(left + half, below_cols - 1)
+                right = min(left + ahead, below_cols - 1)
                 table[offset + row * cols + col] = max(
-                    max(
-                        table[below + top * below_cols + left],
-                        table[below + top * below_cols + right],
-                    ),
-                    max(
-                        table[below + bottom * below_cols + left],
-                        table[below + bottom * below_cols + right],
-                    ),
+                    max(below[top * below_cols + left], below[top * below_cols + right]),
+                    max(below[bottom * below_cols + left], below[bottom * below_cols + right]),
                 )
+        below = table[offset : offset + rows * cols]
+        below_rows, below_cols, below_shift, half = rows, cols, shift, 2 * half
 
 
 @njit(cache=True, nogil=True)

@@ -27,6 +27,8 @@ __all__ = ["ascend", "bound_first", "bound_second", "evaluate", "run"]
 NUM_OPEN, NUM_BOXES, NUM_SECOND, NUM_FOUND, STATUS = range(5)
 DONE, CHUNK_ENDED, HEAP_FULL, FOUND_FULL = range(4)
 
+_LEARNING = 1.0 / 16.0
+
 
 @njit(cache=True, nogil=True)
 def _turn(box):
@@ -513,14 +515,15 @@ def _is_worth_a_climb(value, best, found, counters, box, arm, reach):
 def run(
     points, terms, frames, levels, level_of, half_of, coefficients, bounds, windows, curvatures,
     window, arm, reach, margin, small, gap, keep, radius, max_boxes,
-    boxes, keys, heap, counters, best, found,
+    boxes, keys, heap, counters, best, found, worth,
 ):  # fmt: skip
     """Search until the gap is closed or `max_boxes` more boxes were bounded.
 
     ``best``: lower bound, theta, x, y, ratio to the best from which on a centre is climbed from,
     largest bound of a box that led to an optimum from outside its neighbourhood. ``found``
     (F, 5): optima met: value, theta, x, y, largest bound of the boxes counted to it. ``small``:
-    reach [m] of a box up to which curvature is tried.
+    reach [m] of a box up to which curvature is tried; ``worth``: by size of the box, mean share
+    of the way down to the lower bound that it went.
 
     Boxes are discarded once their bound is below ``keep`` times the lower bound. With ``radius``
     = 0 the search ends when the gap is closed. With a positive one [m], every box above ``keep``
@@ -583,16 +586,27 @@ def run(
                 points, terms, frames, levels, level_of, half_of, bounds, windows, child,
                 floor - margin, cells,
             )  # fmt: skip
-            upper = min(parent_key, upper + margin)
+            first = upper + margin
+            upper = min(parent_key, first)
             counters[NUM_BOXES] += 1
             out[0] = math.inf
-            if upper > floor and child[3] * arm + max(child[4], child[5]) <= small:
+            size = child[3] * arm + max(child[4], child[5])
+            level = min(
+                int(2.0 * math.log2(max(small / max(size, 1e-300), 1.0))), worth.shape[0] - 1
+            )
+            # What seldom helps in boxes of that size is tried now and then only.
+            is_tried = radius > 0.0 or worth[level] > 0.7 or counters[NUM_BOXES] & 14 == 0
+            # In the first phase, what lies below the best is only kept for the second.
+            wanted = floor if radius > 0.0 else best[0]
+            if upper > wanted and size <= small and is_tried:
                 bound_second(
                     points, terms, frames, half_of, coefficients, curvatures, child, out, cells
                 )
                 counters[NUM_SECOND] += 1
+                gain = (first - max(out[0] + margin, wanted)) / (first - wanted)
+                worth[level] += _LEARNING * (max(gain, 0.0) - worth[level])
                 upper = min(upper, out[0] + margin)
-                if upper > floor and _is_worth_a_climb(
+                if upper > wanted and _is_worth_a_climb(
                     out[1], best, found, counters, child, arm, reach
                 ):
                     pose[:] = child[:3]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration import kernels
-from uw_dslam_ros2.core.registration.field import Field, window_spans
+from uw_dslam_ros2.core.registration.field import FIRST_LEVEL, Field, window_spans
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["Problem", "Term", "as_points"]
@@ -76,7 +76,7 @@ class Problem:
                     int(term.is_inverse),
                     sizes[0],
                     *shape,
-                    num_levels,
+                    num_levels - FIRST_LEVEL,
                     sizes[2],
                 ]
             )
