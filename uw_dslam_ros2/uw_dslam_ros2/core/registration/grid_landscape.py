@@ -49,14 +49,15 @@ def scan_landscape(
     poses, scores = [], []
     chance_poses, chance_scores = [], []
     is_whole = _is_whole(num_rotations, window)
+    outside = scan.outside(window) if window is not None else None
     for number, theta in enumerate(_rotations(num_rotations, window)):
         scores_here = scan.scores(theta)
         if is_whole and number % _CHANCE_STRIDE == 0:
             pose, score = _greatest(scan, theta, scores_here)
             chance_poses.append(pose)
             chance_scores.append(score)
-        if window is not None:
-            scores_here = scan.masked(scores_here, window)
+        if outside is not None:
+            scores_here[outside] = -np.inf
         for row, col, score in _peaks(scores_here):
             if score > -math.inf:
                 poses.append((theta, *scan.shift_of(row, col)))
@@ -142,8 +143,8 @@ class _Scan:
         is_low_col = col > last[1] - 2 * PAD + self._half
         return col - num_cols * is_low_col, row - num_rows * is_low_row
 
-    def masked(self, scores: NDArray[np.float32], window: PoseWindow) -> NDArray[np.float32]:
-        """Scores with -inf outside of a window of translations."""
+    def outside(self, window: PoseWindow) -> NDArray[np.bool_]:
+        """Entries of `scores` whose translations lie outside of a window."""
         shifts = [self.shift_of(k, k) for k in range(max(self._shape))]
         col_shift = np.array([s[0] for s in shifts[: self._shape[1]]])
         row_shift = np.array([s[1] for s in shifts[: self._shape[0]]])
@@ -151,7 +152,7 @@ class _Scan:
         high = window.middle[1:] + window.half[1:] + 1.0
         is_col = (col_shift >= low[0]) & (col_shift <= high[0])
         is_row = (row_shift >= low[1]) & (row_shift <= high[1])
-        return np.where(is_row[:, None] & is_col, scores, np.float32(-np.inf))
+        return ~(is_row[:, None] & is_col)
 
     def scores(self, theta: float) -> NDArray[np.float32]:
         """Objective where the source's centre lies; `shift_of` tells where that is."""
@@ -189,8 +190,8 @@ def _splat(image: NDArray[np.float32], points: FloatArray, weights: FloatArray) 
 
 
 def _peaks(scores: NDArray[np.float32]) -> list[tuple[int, int, float]]:
-    """Greatest values and where, each a few cells from the better ones."""
-    image, peaks = scores.copy(), []
+    """Greatest values and where, each a few cells from the better ones; erases them."""
+    image, peaks = scores, []
     for _ in range(_PEAKS_PER_ROTATION):
         row, col = divmod(int(image.argmax()), image.shape[1])
         peaks.append((row, col, float(image[row, col])))

@@ -82,7 +82,7 @@ class VerdictModels:
 
 
 MODELS = VerdictModels(
-    pose=(-2.04, 6.79, -12.91, 0.83, -6.71, 0.27, -0.24),
+    pose=(-3.8006, 6.5251, -11.391, 0.6733, -6.344, 0.8461, -0.1537),
     match=(0.19, 0.89, -0.99),
 )
 """Fitted by `study verdict` with its default settings, which prints them."""
