@@ -20,6 +20,8 @@ _MAX_PEAKS = 12
 # A rival explains at least half as many echoes, and contradicts hardly more of them. The overlap
 # itself is no evidence: on periodic piers it is largest wherever the two submaps begin together.
 _LEAST_SHARE = 0.5
+# A rival that the prior makes twenty times less likely than the pose itself is none.
+_LOG_ODDS = 3.0
 _SLACK = 0.08
 
 
@@ -48,7 +50,7 @@ def has_rival(
 
     Poses with the yaw of ``T_target_source`` are tried, within `half_width_m` of the prior's mean
     and farther than six `sigma_m` from the pose itself. How well a pose explains what is in both
-    submaps is the number of echoes that meet echoes, over these and those on free water.
+    submaps is the number of echoes that meet echoes, over all those where the target has looked.
     """
     stride = max(1, -(-len(source.points) // _MAX_POINTS))
     points = source.points[::stride]
@@ -62,15 +64,24 @@ def has_rival(
     scores = field.window(
         points, np.ones(len(points)), center, np.array([num, num, 0]), step, 1.0
     )[0]
+    limit = _distance(prior, T_target_source) + 2.0 * _LOG_ODDS
     for offset in _peaks(scores, num, step):
         pose = SE2(float(center[0] + offset[0]), float(center[1] + offset[1]), float(center[2]))
         if pose.distance_to(T_target_source)[0] <= 6.0 * sigma_m:
+            continue
+        if _distance(prior, pose) > limit:
             continue
         met, against = _agreement(field, grid, points, pose)
         is_large = met >= _LEAST_SHARE * best_met
         if is_large and _quality(met, against) >= _quality(best_met, best_against) - _SLACK:
             return True
     return False
+
+
+def _distance(prior: Prior, pose: SE2) -> float:
+    """Squared Mahalanobis distance of a pose's place from the prior's mean."""
+    offset = np.array([pose.x - prior.T_target_source.x, pose.y - prior.T_target_source.y])
+    return float(offset @ np.linalg.solve(prior.covariance[:2, :2], offset))
 
 
 def _peaks(scores: FloatArray, num: int, step: float) -> FloatArray:
@@ -93,18 +104,26 @@ def _quality(met: int, against: int) -> float:
 def _agreement(
     field: LikelihoodField, grid: SparseEvidence, points: FloatArray, T_grid_points: SE2
 ) -> tuple[int, int]:
-    """How many points meet echoes, and how many of the others are on free water."""
+    """How many points meet echoes, and how many of the others are where the target has looked."""
     meets = field.values_at(T_grid_points.apply(points)) > _MEETS
-    is_on_water = _on_water(grid, points, T_grid_points)
-    return int(meets.sum()), int((is_on_water & ~meets).sum())
+    _, is_seen = _looked_up(grid, points, T_grid_points)
+    return int(meets.sum()), int((is_seen & ~meets).sum())
 
 
 def _on_water(grid: SparseEvidence, points: FloatArray, T_grid_points: SE2) -> NDArray[np.bool_]:
+    evidence, is_seen = _looked_up(grid, points, T_grid_points)
+    return is_seen & (evidence < -_SURELY_FREE_NATS * UNITS_PER_NAT)
+
+
+def _looked_up(
+    grid: SparseEvidence, points: FloatArray, T_grid_points: SE2
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Evidence (N,) under the points, and whether their cells were observed (N,)."""
     cells = np.floor(T_grid_points.apply(points) / grid.resolution_m).astype(np.int64)
     rows, cols = cells[:, 1] - grid.row, cells[:, 0] - grid.col
     inside = (rows >= 0) & (cols >= 0)
     inside &= (rows < grid.evidence.shape[0]) & (cols < grid.evidence.shape[1])
-    result = np.zeros(len(points), np.bool_)
-    evidence = grid.evidence[rows[inside], cols[inside]]
-    result[inside] = evidence < -_SURELY_FREE_NATS * UNITS_PER_NAT
-    return result
+    evidence, is_seen = np.zeros(len(points), np.int32), np.zeros(len(points), np.bool_)
+    evidence[inside] = grid.evidence[rows[inside], cols[inside]]
+    is_seen[inside] = grid.observed[rows[inside], cols[inside]]
+    return evidence, is_seen
