@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -74,6 +75,7 @@ def test_the_report_is_one_file_that_says_all(folder: Path) -> None:
     assert sources
     assert all(source.startswith("data:image/png;base64,") for source in sources)
     assert not re.search(r'(href|src)="http', html)
+    _Balance().check(html)
 
 
 def test_the_numbers_are_there_without_times(folder: Path) -> None:
@@ -91,6 +93,29 @@ def test_pictures_are_not_empty(folder: Path) -> None:
         assert image is not None
         assert image.shape[1] > 600
         assert image.std() > 10.0
+
+
+class _Balance(HTMLParser):
+    """Every element is closed, in the right order, and no id is used twice."""
+
+    _VOID = frozenset({"meta", "img", "br", "hr", "link", "input", "col", "wbr"})
+
+    def check(self, html: str) -> None:
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+        assert len(self.ids) == len(set(self.ids))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.ids += [value for name, value in attrs if name == "id" and value]
+        if tag not in self._VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag, f"</{tag}> at line {self.getpos()[0]}"
 
 
 @pytest.mark.parametrize("num_vehicles", [1, 2, 3])
