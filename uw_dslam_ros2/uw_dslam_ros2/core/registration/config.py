@@ -15,7 +15,9 @@ class RegistrationConfig(Config):
 
     ``method`` "likelihood" searches the logarithm of a likelihood ratio (each point has a partner
     or is clutter) with a ladder of kernels, and estimates noise and clutter share; "gmrbnb" is the
-    paper's: plain sum of Gaussians, inliers by nearest-neighbour density, second search.
+    paper's: plain sum of Gaussians, inliers by nearest-neighbour density, second search. The
+    defaults of ``nnde_neighbors`` and ``nnde_threshold`` are from ``study nnde --sweep``; what
+    they are worth on other seeds stands in docs/experiments.md.
     """
 
     method: str = setting(
@@ -41,8 +43,8 @@ class RegistrationConfig(Config):
     )
     max_rivals: int = setting(8, 0, 1000, "other poses reported")
     nnde_neighbors: int = setting(
-        1, 1, 50, "K: neighbours in the other set whose mean distance gives a point's density"
+        5, 1, 50, "K: neighbours in the other set whose mean distance gives a point's density"
     )
     nnde_threshold: float = setting(
-        0.5, 0.0, 1.0, "normalised density above which a point is an inlier"
+        0.2, 0.0, 1.0, "normalised density above which a point is an inlier"
     )
