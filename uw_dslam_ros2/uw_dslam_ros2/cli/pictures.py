@@ -156,7 +156,7 @@ class _Layout:
         width = height * merged[0] / merged[1]
         left = 2.5 * GAP + max(column, 1.9)
         large = (left, FOOT, width, height)
-        return cls(max(left + width + GAP, left + 6.2), height + FOOT + HEAD, tuple(boxes), large)
+        return cls(max(left + width + GAP, left + 6.7), height + FOOT + HEAD, tuple(boxes), large)
 
     @classmethod
     def _above(cls, own: Sequence[tuple[float, float]], merged: tuple[float, float]) -> _Layout:
