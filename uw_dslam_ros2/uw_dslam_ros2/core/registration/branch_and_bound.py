@@ -210,7 +210,7 @@ class _Search:
         has_all_rivals = self._settings.keep >= 1.0
         if status is Status.CERTIFIED and not has_all_rivals:
             spent = int(self._counters[kernels.NUM_BOXES])
-            max_boxes = min(max_boxes, spent + int(self._settings.rival_share * spent) + _CHUNK)
+            max_boxes = min(max_boxes, spent + int(self._settings.rival_share * spent))
             ended = self._chunks(
                 self._problem.radius, max_boxes, progress, is_cancelled, f"{stage}, rivals"
             )

@@ -54,6 +54,8 @@ _MAX_SIGMA = 1.2  # most noise that is believed in, in spacings: beyond, partner
 _DECISIVE = 1e-4  # probability of chance below which nothing further need be tried
 _INDEPENDENT = 0.3  # kernel, in spacings, that the points' independence is judged with
 _CONTRAST = 10.0  # and the density on a target over that of clutter
+_RIVAL_FACTOR = 0.95  # of the best score, down to which other poses are excluded with a proof
+_RIVAL_BOXES = 0.25  # boxes for that, as a share of those that the best took
 
 
 def register_point_sets(
@@ -240,7 +242,9 @@ class _Match:
         left = math.inf
         if config.max_seconds > 0.0 and self._clock:
             left = max(config.max_seconds - (self._clock() - self._start), 0.0)
-        return SearchSettings(config.gap, max_boxes, left, config.max_memory_mb)
+        return SearchSettings(
+            config.gap, max_boxes, left, config.max_memory_mb, _RIVAL_FACTOR, _RIVAL_BOXES
+        )
 
     def _rung(self, sigma_m: float | None, max_boxes: int) -> Rung:
         """Search with one kernel (None: each point its own) and refine what was met."""

@@ -105,12 +105,15 @@ def _values(rung: Rung, poses: Sequence[SE2]) -> list[float]:
 def _rivals(
     pair: Pair, rung: Rung, candidates: Sequence[Candidate], values: Sequence[float]
 ) -> tuple[Rival, ...]:
-    """The other poses, scored as shares of the best one's objective."""
+    """The other poses, scored as shares of the best one's objective, bounded around each."""
     best = max(values[0], 1e-300)
-    bound = rung.outcome.upper_bound / best
     others = [r.pose() for _, r in candidates[1 : len(values)]]
     return tuple(
-        Rival(pair.full_pose(pose), max(value, 0.0) / best, bound)
+        Rival(
+            pair.full_pose(pose),
+            max(value, 0.0) / best,
+            max(rung.outcome.upper_bound_near(pose), value) / best,
+        )
         for pose, value in zip(others, values[1:], strict=True)
     )
 
