@@ -181,3 +181,38 @@ def test_ten_percent_in_common_is_refused():
         source, target = scene(np.random.default_rng([31, seed]), 5, 45, 45, 0.02)
         result = register_point_sets(source, target, RegistrationConfig(max_boxes=40_000))
         assert not result.is_accepted, result.reason
+
+
+def walls(rng, segments, noise=0.01, step=0.1):
+    """Points along segments (K, 4) of x, y, x, y, sampled afresh with every call."""
+    points = []
+    for x0, y0, x1, y1 in segments:
+        count = round(math.hypot(x1 - x0, y1 - y0) / step)
+        along = (np.arange(count) + rng.uniform(0.0, 1.0, count)) / count
+        points.append(np.column_stack([x0 + along * (x1 - x0), y0 + along * (y1 - y0)]))
+    together = np.vstack(points)
+    return together + rng.normal(0.0, noise, together.shape)
+
+
+def test_a_corridor_without_features_is_not_accepted():
+    rng = np.random.default_rng(13)
+    corridor = [(-5.0, -1.0, 5.0, -1.0), (-5.0, 1.0, 5.0, 1.0)]
+    for _ in range(3):
+        seen = walls(rng, corridor), PLANTED.apply(walls(rng, corridor))
+        result = register_point_sets(*seen)
+        assert not result.is_accepted, result.reason
+
+
+def test_a_room_with_a_corner_of_its_own_is_accepted():
+    rng = np.random.default_rng(14)
+    room = [
+        (0.0, 0.0, 5.0, 0.0), (5.0, 0.0, 5.0, 2.0), (5.0, 2.0, 3.2, 2.0), (3.2, 2.0, 3.2, 4.1),
+        (3.2, 4.1, 0.0, 4.1), (0.0, 4.1, 0.0, 0.0), (1.0, 1.2, 1.7, 1.4), (1.7, 1.4, 1.5, 2.3),
+    ]  # fmt: skip
+    result = register_point_sets(walls(rng, room), PLANTED.apply(walls(rng, room)))
+    assert result.is_accepted, result.reason
+    translation, rotation = result.T_target_source.distance_to(PLANTED)
+    assert translation < 0.05
+    assert rotation < math.radians(1.0)
+    # As wide as the error, and wider than that of as many independent points.
+    assert result.covariance[0, 0] > 2.0 * 0.01**2 * 2.0 / len(walls(rng, room))
