@@ -9,16 +9,34 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-__all__ = ["Timing", "context", "emit", "require", "run_cases", "timed"]
+__all__ = ["Budget", "Timing", "context", "emit", "require", "run_cases", "tables", "timed"]
 
 _CONTEXT: dict[str, Any] = {}
+_ROWS: list[dict[str, Any]] = []
+
+
+class Budget:
+    """Seconds that a case may take, for cases that can make do with fewer trials."""
+
+    seconds = 300.0  # --minutes sets it
+    start = 0.0
+
+    @classmethod
+    def restart(cls) -> None:
+        """Begin a case."""
+        cls.start = time.monotonic()
+
+    @classmethod
+    def left_s(cls, share: float = 1.0) -> float:
+        """Seconds left until that share of the case's time is used up."""
+        return cls.start + share * cls.seconds - time.monotonic()
 
 
 def context() -> dict[str, Any]:
@@ -90,8 +108,37 @@ def require(is_true: bool, what: str) -> None:
 def emit(case: str, values: Mapping[str, Any]) -> None:
     """Print one JSON line."""
     plain = {key: _plain(value) for key, value in values.items()}
-    load = round(os.getloadavg()[0], 2)
-    print(json.dumps({"case": case, **plain, "load": load, **context()}), flush=True)
+    row = {"case": case, **plain, "load": round(os.getloadavg()[0], 2), **context()}
+    _ROWS.append(row)
+    print(json.dumps(row), flush=True)
+
+
+def tables(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown: one table a case, without what is the same in all rows of a run."""
+    known = {"case", "load", *context()}
+    lines = []
+    for case in dict.fromkeys(row["case"] for row in rows):
+        group = [row for row in rows if row["case"] == case]
+        keys = [key for key in dict.fromkeys(k for row in group for k in row) if key not in known]
+        cells = [[_text(row.get(key)) for key in keys] for row in group]
+        if len(group) == 1:
+            keys, cells = ["figure", case], [list(pair) for pair in zip(keys, *cells, strict=True)]
+        lines += [
+            f"**{case}**, load {group[0].get('load')}",
+            "",
+            _line(keys),
+            "|---" * len(keys) + "|",
+        ]
+        lines += [*map(_line, cells), ""]
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _text(value: Any) -> str:
+    return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def run_cases(
@@ -104,14 +151,35 @@ def run_cases(
     )
     parser.add_argument("case", nargs="*", help=f"cases to run (default: all). {texts}")
     parser.add_argument("--quick", action="store_true", help="few runs, to see that it works")
+    parser.add_argument(
+        "--minutes", type=float, default=5.0, help="for cases that can do with fewer trials"
+    )
+    parser.add_argument("--out", type=Path, help="file that gets the JSON lines, too")
+    parser.add_argument("--table", type=Path, help="print the tables of such a file and stop")
     args = parser.parse_args(argv)
+    if args.table:
+        print(tables([json.loads(line) for line in args.table.read_text().splitlines()]))
+        return 0
     unknown = [name for name in args.case if name not in cases]
     if unknown:
         parser.error(f"no case {unknown[0]!r}; there are {', '.join(cases)}")
+    Budget.seconds = 60.0 * args.minutes
+    failed = []
     for name in args.case or cases:
         print(f"# {name}", file=sys.stderr, flush=True)
-        cases[name](args.quick)
-    return 0
+        Budget.restart()
+        try:
+            cases[name](args.quick)
+        except SystemExit as error:
+            # A wrong answer of one case is no reason to lose the others.
+            failed.append(name)
+            print(f"# {name}: {error}", file=sys.stderr, flush=True)
+        if args.out:
+            args.out.write_text("".join(json.dumps(row) + "\n" for row in _ROWS))
+    print(tables(_ROWS), file=sys.stderr)
+    if failed:
+        print(f"# wrong: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
 
 
 def _rounded(value: Any) -> float:
