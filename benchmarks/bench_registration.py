@@ -40,7 +40,7 @@ from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem
 
 _SIGMA_M = 0.1  # the paper's
 _NODES_PER_SIGMA = 5.0  # of the field's lattice; its error falls with the third power
-_SEARCH_SHARE = 0.5  # of the gap; the rest is for the field's error
+_SEARCH_SHARE = 0.45  # of the gap; the rest is for the field's error
 _PEERS = ["ICP, 36 starts", "correlative BnB", "pair voting"]
 _GO_ICP = "Go-ICP in SE(2)"
 
