@@ -118,13 +118,18 @@ def run(args: argparse.Namespace) -> int:
         for name, method in methods.items():
             placing, num_searches, cpu_s = _merged(mission, method)
             rows.append(_row(mission, name, placing, num_searches, cpu_s))
-        print(", ".join(f"{r['method']} {r['rmse_m']:.2f} m" for r in rows if r["mission"] == mission.name))  # fmt: skip  # noqa: E501
+        own = [row for row in rows if row["mission"] == mission.name]
+        print(f"{mission.name}: " + ", ".join(_short(row) for row in own), flush=True)
     if not rows:
         raise DataError("nothing to merge: give --seeds or --data")
     write_csv(args.out / "merging.csv", rows)
     _draw(rows, args.out / "merging.png")
     _report(rows)
     return 0
+
+
+def _short(row: dict[str, Any]) -> str:
+    return f"{row['method']} {row['rmse_m']:.2f} m ({row['vehicles']} of {row['of']})"
 
 
 def _missions(args: argparse.Namespace) -> Iterator[FleetMission]:
