@@ -83,7 +83,7 @@ class VerdictModels:
 
 MODELS = VerdictModels(
     pose=(-3.8006, 6.5251, -11.391, 0.6733, -6.344, 0.8461, -0.1537),
-    match=(0.19, 0.89, -0.99),
+    match=(0.0944, 0.8869, -0.7805),
 )
 """Fitted by `study verdict` with its default settings, which prints them."""
 
