@@ -13,7 +13,8 @@ __all__ = ["warm_up"]
 
 def warm_up() -> None:
     """Match a few points with every method, and two small maps."""
-    points = np.random.default_rng(0).uniform(-1.0, 1.0, (8, 2))
+    points, others = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 8, 2))
     for method in ("likelihood", "gmrbnb"):
         register_point_sets(points, points + 1.0, RegistrationConfig(method=method, gap=0.2))
+    register_point_sets(points, others)  # undecided: every kernel is asked
     warm_up_grids()
