@@ -6,6 +6,7 @@ have windows, through which rays leave and draw the streaks of such maps.
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import cv2
@@ -96,7 +97,7 @@ def draw_hall(size: int, rng: np.random.Generator) -> ByteGrid:
         corner, box = rng.uniform(0, size, 2), rng.uniform(30, 120, 2)
         turn = axes if rng.random() < 0.7 else axes[::-1] * (1.0, -1.0)
         outline = corner + np.array([[0, 0], [box[0], 0], box, [0, box[1]]]) @ turn
-        for a, b in zip(outline[:-1], outline[1:], strict=True):
+        for a, b in itertools.pairwise(outline):
             _wall(image, a, b, rng)
     for _ in range(int(size * size / rng.uniform(3000, 8000))):
         cv2.circle(image, _ints(rng.uniform(0, size, 2)), int(rng.integers(0, 3)), 1, -1)
