@@ -149,7 +149,8 @@ def run_cases(
     texts = "; ".join(
         f"{name}: {(case.__doc__ or '').split('.')[0]}" for name, case in cases.items()
     )
-    parser.add_argument("case", nargs="*", help=f"cases to run (default: all). {texts}")
+    escaped = texts.replace("%", "%%")  # argparse formats its help texts
+    parser.add_argument("case", nargs="*", help=f"cases to run (default: all). {escaped}")
     parser.add_argument("--quick", action="store_true", help="few runs, to see that it works")
     parser.add_argument(
         "--minutes", type=float, default=5.0, help="for cases that can do with fewer trials"
