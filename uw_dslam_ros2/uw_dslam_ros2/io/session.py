@@ -194,6 +194,7 @@ def _write(connection: sqlite3.Connection, state: QueueState) -> None:
         "vehicles": state.vehicles,
         "next_request_id": state.next_request_id,
         "standing": [[s.hex(), t.hex(), prior] for s, t, prior in sorted(state.standing)],
+        "is_pinned": state.is_pinned,
     }
     for name, value in meta.items():
         row = name, json.dumps(value)
@@ -231,6 +232,7 @@ def _read(connection: sqlite3.Connection) -> QueueState:
             (bytes.fromhex(source), bytes.fromhex(target), tuple(prior))
             for source, target, prior in meta["standing"]
         ),
+        bool(meta.get("is_pinned", True)),
     )
 
 

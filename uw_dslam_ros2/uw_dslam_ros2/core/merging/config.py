@@ -19,7 +19,7 @@ class MapQueueConfig(Config):
         choices=("graph", "pairwise"),
     )
     anchor_vehicle: str = setting(
-        "", doc="vehicle whose first submap pins the global frame; empty: the first that arrives"
+        "", doc="vehicle whose first submap pins the global frame; empty: the first that is joined"
     )
     resolution_m: float = setting(
         0.0, 0.0, 10.0, "cell size of the global map [m]; 0: that of the pinning submap"

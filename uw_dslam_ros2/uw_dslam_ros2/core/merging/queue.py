@@ -40,8 +40,10 @@ class MapQueue:
 
     Sans-IO: the caller carries the requests to registration servers and brings back the results,
     in any order and at any time. The global frame "map" is the frame of the first submap that
-    came in (or of the first one of ``config.anchor_vehicle``) and never moves; that submap's
-    cells are the lattice of the global map.
+    came in (or of the first one of ``config.anchor_vehicle``); that submap's cells are the lattice
+    of the global map. Where the first vehicle stays alone while others are joined, the frame goes
+    over to the largest group as soon as no question is left. Once vehicles are joined in it, it
+    never moves.
     """
 
     def __init__(self, config: MapQueueConfig | None = None) -> None:
@@ -49,6 +51,7 @@ class MapQueue:
         self._submaps: dict[SubmapId, StoredSubmap] = {}
         self._withdrawn: set[SubmapId] = set()
         self._anchor: SubmapId | None = None
+        self._is_pinned = False  # for good: named by the settings, or vehicles are joined in it
         self._vehicles: list[str] = []
         self._answers: dict[MatchKey, Answer] = {}
         self._standing: frozenset[MatchKey] = frozenset()
@@ -91,9 +94,8 @@ class MapQueue:
             self._vehicles.append(submap.vehicle_id)
         wanted = self._config.anchor_vehicle
         if self._anchor is None and wanted in ("", submap.vehicle_id):
-            self._anchor = submap.submap_id
-            resolution_m = self._config.resolution_m or submap.grid.spec.resolution_m
-            self._lattice = pinned_lattice(submap.grid.spec, resolution_m)
+            self._pin(submap.submap_id)
+            self._is_pinned = bool(wanted)
         self._change()
         return True
 
@@ -250,6 +252,7 @@ class MapQueue:
             tuple(self._vehicles),
             self._next_request_id,
             self._standing,
+            self._is_pinned,
         )
 
     @classmethod
@@ -263,6 +266,7 @@ class MapQueue:
         queue._answers = {answer.match.key: answer for answer in state.answers}
         queue._standing = frozenset(state.standing)
         queue._anchor, queue._lattice = state.anchor, state.lattice
+        queue._is_pinned = state.is_pinned
         queue._vehicles = list(state.vehicles)
         queue._next_request_id = state.next_request_id
         return queue
@@ -306,7 +310,31 @@ class MapQueue:
                 plan = make(library, self._answers, self._standing, anchor, self._config)
             self._standing = frozenset(joint.key for joint in plan.joints if joint.is_inlier)
             self._plan_cache = plan
+            if self._goes_over(plan):
+                self._plan_cache = None
+                return self._plan()
         return self._plan_cache
+
+    def _goes_over(self, plan: Plan) -> bool:
+        """Pin the frame for good where vehicles are joined; whether that is another submap."""
+        if self._is_pinned or self._is_growing or plan.wanted or self._in_flight:
+            return False
+        joined = [part for part in plan.components if len({i[0] for i in part}) > 1]
+        if not joined:
+            return False
+        self._is_pinned = True
+        if any(self._anchor in part for part in joined):
+            return False
+        largest = max(joined, key=lambda part: (len({i[0] for i in part}), len(part)))
+        self._pin(min(largest, key=lambda i: (self._vehicles.index(i[0]), i[1])))
+        return True
+
+    def _pin(self, submap_id: SubmapId) -> None:
+        spec = self._submaps[submap_id].submap.grid.spec
+        self._anchor = submap_id
+        self._lattice = pinned_lattice(spec, self._config.resolution_m or spec.resolution_m)
+        self._global_map = None
+        self._is_drawn = False
 
     def _request(self, match: Match) -> MatchRequest:
         request_id = self._next_request_id
@@ -327,12 +355,13 @@ class MapQueue:
 
     def _drawn(self) -> GlobalMap | None:
         """The global map, up to date: draws only what is new or has moved."""
+        merged = self._merged()  # may move the frame, hence first
         if self._lattice is None:
             return None
         if self._global_map is None:
             self._global_map = GlobalMap(self._lattice, self._config.log_odds_max)
         if not self._is_drawn:
-            shown = {i: T for i, T in self._merged().items() if i not in self._withdrawn}
+            shown = {i: T for i, T in merged.items() if i not in self._withdrawn}
             self._global_map.draw(self._submaps, shown)
             self._is_drawn = True
         return self._global_map

@@ -31,3 +31,5 @@ class QueueState:
     next_request_id: int
     standing: frozenset[MatchKey]
     """Answers that hold in the graph."""
+    is_pinned: bool = False
+    """Whether the global frame stays where it is, whatever comes."""
