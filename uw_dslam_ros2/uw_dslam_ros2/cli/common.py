@@ -9,14 +9,23 @@ import platform
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Protocol
 
 from tqdm import tqdm
 
 import uw_dslam_ros2
-from uw_dslam_ros2.core.errors import UwDslamError
+from uw_dslam_ros2.core.errors import DataError, UwDslamError
 
-__all__ = ["EXIT_BAD_INPUT", "Progress", "parser_for", "progress_bar", "run_command", "versions"]
+__all__ = [
+    "EXIT_BAD_INPUT",
+    "Progress",
+    "config_file",
+    "parser_for",
+    "progress_bar",
+    "run_command",
+    "versions",
+]
 
 EXIT_BAD_INPUT = 2
 """Exit code for wrong usage, files and settings; argparse uses the same."""
@@ -82,3 +91,14 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:  # an installed ROS names some differently
             found[library] = "unknown"
     return found
+
+
+def config_file(name: str) -> Path:
+    """Find a settings file of ours: in the checkout, or where colcon installed it."""
+    folders = [Path(uw_dslam_ros2.__file__).resolve().parents[2] / "config"]
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(":")
+    folders += [Path(prefix) / "share" / "uw_dslam_ros2" / "config" for prefix in prefixes]
+    found = [folder / name for folder in folders if (folder / name).is_file()]
+    if not found:
+        raise DataError(f"the settings file {name} is in none of {', '.join(map(str, folders))}")
+    return found[0]

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import uw_dslam_ros2
 from uw_dslam_ros2.cli.common import (
+    config_file,
     num_processors,
     parser_for,
     progress_bar,
@@ -222,20 +222,9 @@ def _convert(args: argparse.Namespace, out: Path, steps: _Steps) -> _Recordings:
         tuple(chosen),
         read_truth(out / "recordings" / "truth"),
         "points",
-        args.config or _config_file("aracati2017.yaml"),
+        args.config or config_file("aracati2017.yaml"),
         {},
     )
-
-
-def _config_file(name: str) -> Path:
-    """Find a settings file of ours: in the checkout, or where colcon installed it."""
-    folders = [Path(uw_dslam_ros2.__file__).resolve().parents[2] / "config"]
-    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(":")
-    folders += [Path(prefix) / "share" / "uw_dslam_ros2" / "config" for prefix in prefixes]
-    found = [folder / name for folder in folders if (folder / name).is_file()]
-    if not found:
-        raise DataError(f"the settings file {name} is in none of {', '.join(map(str, folders))}")
-    return found[0]
 
 
 # --- nodes -----------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.cli.common import config_file
 from uw_dslam_ros2.cli.outcome import Trajectory
 from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M
 from uw_dslam_ros2.cli.studies._common import (
@@ -85,9 +86,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--aracati-config",
         type=Path,
-        default=Path("config/aracati2017.yaml"),
+        default=None,
         metavar="FILE",
-        help="settings for the real recording (default: %(default)s)",
+        help="settings for the real recording (default: ours)",
     )
 
 
@@ -146,7 +147,12 @@ def _missions(args: argparse.Namespace) -> Iterator[FleetMission]:
     with TemporaryDirectory() as work:
         write_bags(read_aracati2017(folder), Path(work))
         bags = tuple(Path(work) / f"auv_{number}" for number in (1, 2, 3))
-        yield mapped_bags("aracati2017", bags, Path(work) / "truth", args.aracati_config)
+        yield mapped_bags(
+            "aracati2017",
+            bags,
+            Path(work) / "truth",
+            (args.aracati_config or config_file("aracati2017.yaml")),
+        )
 
 
 # --- matchers --------------------------------------------------------------------------------

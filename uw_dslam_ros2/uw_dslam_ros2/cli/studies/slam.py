@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.cli.common import config_file
 from uw_dslam_ros2.cli.studies._common import (
     COLOURS,
     data_dir,
@@ -101,9 +102,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--aracati-config",
         type=Path,
-        default=Path("config/aracati2017.yaml"),
+        default=None,
         metavar="FILE",
-        help="settings for the real recording (default: %(default)s)",
+        help="settings for the real recording (default: ours)",
     )
 
 
@@ -169,7 +170,7 @@ def _cases(args: argparse.Namespace, work: Path) -> Iterator[_Case]:
         print(f"Aracati 2017 is left out: {error}")
         return
     recording = read_aracati2017(folder)
-    file = SettingsFile(args.aracati_config)
+    file = SettingsFile(args.aracati_config or config_file("aracati2017.yaml"))
     settings = file.section(VehicleMapperConfig, "mapper", "/auv_1/sonar_mapper")
     spans = {"aracati_whole": (0, recording.num_keyframes - 1)}
     spans |= {f"aracati_part_{i + 1}": span for i, span in enumerate(SEGMENTS)}
