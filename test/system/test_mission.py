@@ -175,6 +175,9 @@ def check_contract(client):
             assert is_latched == (topic.replace("auv_2", "auv_1") in IS_LATCHED), topic
     for sensor in ("sonar", "imu", "dvl", "depth"):
         assert client.node.get_subscriptions_info_by_topic(f"/auv_1/{sensor}"), sensor
+    client.until(
+        lambda: set(SERVICES) <= set(dict(client.node.get_service_names_and_types())), "services"
+    )
     services = dict(client.node.get_service_names_and_types())
     assert {name: services.get(name) for name in SERVICES} == {
         name: [kind] for name, kind in SERVICES.items()
