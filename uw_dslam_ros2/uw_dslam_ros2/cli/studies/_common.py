@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import math
 import os
@@ -16,16 +17,21 @@ from cycler import cycler
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from uw_dslam_ros2.cli.common import config_file
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = [
+    "ARACATI",
     "COLOURS",
     "SUCCESS_M",
     "SUCCESS_RAD",
+    "add_aracati_arguments",
+    "aracati_settings",
     "data_dir",
     "figure",
     "is_success",
+    "optional_data_dir",
     "print_table",
     "progress",
     "save_figure",
@@ -37,6 +43,9 @@ __all__ = [
 # The success region of the synthetic protocol: 2 degrees and 0.05 (the square's side is 2).
 SUCCESS_RAD = math.radians(2.0)
 SUCCESS_M = 0.05
+
+ARACATI = "aracati2017"
+"""The real recording, as its folder and its settings file are called."""
 
 # Okabe and Ito's palette: told apart in print and by colour-blind readers.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
@@ -129,6 +138,33 @@ def data_dir(given: Path | None, dataset: str) -> Path:
     if not folder.is_dir():
         raise DataError(f"the data folder {folder} does not exist")
     return folder
+
+
+def optional_data_dir(given: Path | None, dataset: str) -> Path | None:
+    """Folder of a recording as `data_dir`; None, and a line that says so, if it is not given."""
+    try:
+        return data_dir(given, dataset)
+    except DataError as error:
+        if given is not None:
+            raise
+        print(f"{dataset} is left out: {error}")
+        return None
+
+
+def add_aracati_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of a study that also maps the real recording Aracati 2017."""
+    parser.add_argument("--data", type=Path, metavar="DIR", help=f"folder with {ARACATI}")
+    parser.add_argument(
+        "--aracati-config",
+        type=Path,
+        metavar="FILE",
+        help="settings for the real recording (default: ours)",
+    )
+
+
+def aracati_settings(args: argparse.Namespace) -> Path:
+    """Settings file for the real recording, of `add_aracati_arguments`."""
+    return args.aracati_config or config_file(f"{ARACATI}.yaml")
 
 
 def summary(values: Sequence[float]) -> tuple[float, float]:

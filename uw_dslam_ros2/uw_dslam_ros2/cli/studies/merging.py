@@ -21,13 +21,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.cli.common import config_file
 from uw_dslam_ros2.cli.outcome import Trajectory
 from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M
 from uw_dslam_ros2.cli.studies._common import (
+    ARACATI,
     COLOURS,
-    data_dir,
+    add_aracati_arguments,
+    aracati_settings,
     figure,
+    optional_data_dir,
     print_table,
     progress,
     save_figure,
@@ -82,14 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--place", choices=PLACES, default="harbour")
     parser.add_argument("--methods", nargs="*", choices=sorted(_methods()), metavar="METHOD",
                         help=f"default: all of {', '.join(_methods())}")  # fmt: skip
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder with aracati2017")
-    parser.add_argument(
-        "--aracati-config",
-        type=Path,
-        default=None,
-        metavar="FILE",
-        help="settings for the real recording (default: ours)",
-    )
+    add_aracati_arguments(parser)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,21 +132,17 @@ def _missions(args: argparse.Namespace) -> Iterator[FleetMission]:
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     for seed in progress(seeds, text="missions"):
         yield simulated_mission(seed, args.vehicles, args.duration, args.place, args.out / "cache")
-    try:
-        folder = data_dir(args.data, "aracati2017")
-    except DataError as error:
-        if args.data is not None:
-            raise
-        print(f"Aracati 2017 is left out: {error}")
+    folder = optional_data_dir(args.data, ARACATI)
+    if folder is None:
         return
     with TemporaryDirectory() as work:
         write_bags(read_aracati2017(folder), Path(work))
         bags = tuple(Path(work) / f"auv_{number}" for number in (1, 2, 3))
         yield mapped_bags(
-            "aracati2017",
+            ARACATI,
             bags,
             Path(work) / "truth",
-            (args.aracati_config or config_file("aracati2017.yaml")),
+            aracati_settings(args),
         )
 
 

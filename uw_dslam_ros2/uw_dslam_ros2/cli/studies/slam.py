@@ -19,11 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.cli.common import config_file
 from uw_dslam_ros2.cli.studies._common import (
+    ARACATI,
     COLOURS,
-    data_dir,
+    add_aracati_arguments,
+    aracati_settings,
     figure,
+    optional_data_dir,
     print_table,
     progress,
     save_figure,
@@ -98,14 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=list(_TITLES),
         help="dead reckoning is always among them",
     )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder with aracati2017")
-    parser.add_argument(
-        "--aracati-config",
-        type=Path,
-        default=None,
-        metavar="FILE",
-        help="settings for the real recording (default: ours)",
-    )
+    add_aracati_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -162,15 +157,11 @@ def _cases(args: argparse.Namespace, work: Path) -> Iterator[_Case]:
             read_map(mission.truth_map),
         )
         shutil.rmtree(mission.folder)
-    try:
-        folder = data_dir(args.data, "aracati2017")
-    except DataError as error:
-        if args.data is not None:
-            raise
-        print(f"Aracati 2017 is left out: {error}")
+    folder = optional_data_dir(args.data, ARACATI)
+    if folder is None:
         return
     recording = read_aracati2017(folder)
-    file = SettingsFile(args.aracati_config or config_file("aracati2017.yaml"))
+    file = SettingsFile(aracati_settings(args))
     settings = file.section(VehicleMapperConfig, "mapper", "/auv_1/sonar_mapper")
     spans = {"aracati_whole": (0, recording.num_keyframes - 1)}
     spans |= {f"aracati_part_{i + 1}": span for i, span in enumerate(SEGMENTS)}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.config import LoopConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.graph import SubmapGraph
 from uw_dslam_ros2.core.mapping.matcher import (
     LikelihoodField,
@@ -20,17 +22,17 @@ from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, regist
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["find_loops", "with_bend"]
+__all__ = ["find_loops", "nearby", "with_bend"]
 
 FloatArray = NDArray[np.float64]
 # A match takes a submap as rigid; on average half of its own drift lies between its points.
 _BEND_SHARE = 0.25
-# The proof matters less than the verdict here: the window is small and many pairs are tried.
 _DIGITS = 6
 _HOPELESS = 0.15
 _SURE_LEAD, _SURE_CONFLICT = 0.05, 0.1
 _NEAR_RAD = 0.02
 _COARSEST = 8.0
+# The proof matters less than the verdict here: the window is small and many pairs are tried.
 _REGISTRATION = GridRegistrationConfig(max_boxes=20_000)
 
 
@@ -42,7 +44,7 @@ def find_loops(
     if len(sections[source].points) < config.loop.min_points:
         return False
     found = False
-    for target in _candidates(graph, sections, source, config):
+    for target in nearby(sections, graph.poses, source, config.loop):
         T_target_source, covariance = graph.relative(target, source)
         answer = _verified(
             sections[target], sections[source], Prior(T_target_source, covariance), config
@@ -53,22 +55,28 @@ def find_loops(
     return graph.optimize() if found else False
 
 
-def _candidates(
-    graph: SubmapGraph, sections: list[ClosedSection], source: int, config: VehicleMapperConfig
+def nearby(
+    sections: Sequence[ClosedSection],
+    poses: Sequence[SE2],
+    source: int,
+    config: LoopConfig,
+    slack_m: float = 0.0,
 ) -> list[int]:
-    """Earlier submaps, not the neighbours, whose points may overlap; the nearest first."""
-    poses = graph.poses
+    """Earlier submaps, not the neighbour, whose points may overlap; the nearest first.
+
+    ``poses`` place the submaps in one frame, to within ``slack_m``.
+    """
     here = poses[source].apply(sections[source].center)
     scored = []
     for target in range(source - 1):
-        if len(sections[target].points) < config.loop.min_points:
+        if len(sections[target].points) < config.min_points:
             continue
         distance = float(np.linalg.norm(poses[target].apply(sections[target].center) - here))
-        reach = 0.7 * (sections[target].radius_m + sections[source].radius_m)
+        reach = 0.7 * (sections[target].radius_m + sections[source].radius_m) + slack_m
         if distance < reach:
             scored.append((distance / reach, target))
     scored.sort()
-    return [target for _, target in scored[: config.loop.max_candidates]]
+    return [target for _, target in scored[: config.max_candidates]]
 
 
 def _verified(

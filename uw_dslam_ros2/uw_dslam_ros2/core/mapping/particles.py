@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.covariances import rotated_covariance
-from uw_dslam_ros2.core.mapping.loops import with_bend
+from uw_dslam_ros2.core.mapping.loops import nearby, with_bend
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.mapping.occupancy import SparseEvidence
 from uw_dslam_ros2.core.mapping.rivals import conflict
@@ -125,22 +125,11 @@ class ParticleFilter:
 
     def _candidates(self, sections: list[ClosedSection]) -> list[int]:
         """Earlier submaps, not the neighbour, that the newest may overlap; the nearest first."""
-        config, poses, newest = self._config.loop, self.poses, len(sections) - 1
-        section = sections[newest]
-        if not config.is_enabled or len(section.points) < config.min_points:
+        config, newest = self._config.loop, len(sections) - 1
+        if not config.is_enabled or len(sections[newest].points) < config.min_points:
             return []
-        here = poses[newest].apply(section.center)
-        slack = 2.0 * math.sqrt(float(np.linalg.eigvalsh(self.covariance()[:2, :2])[-1]))
-        scored = []
-        for index in range(newest - 1):
-            other = sections[index]
-            if len(other.points) < config.min_points:
-                continue
-            distance = float(np.linalg.norm(poses[index].apply(other.center) - here))
-            reach = 0.7 * (other.radius_m + section.radius_m) + slack
-            if distance < reach:
-                scored.append((distance / reach, index))
-        return [index for _, index in sorted(scored)[: config.max_candidates]]
+        slack_m = 2.0 * math.sqrt(float(np.linalg.eigvalsh(self.covariance()[:2, :2])[-1]))
+        return nearby(sections, self.poses, newest, config, slack_m)
 
     def _relative(self, particle: int, targets: list[int]) -> FloatArray:
         """Poses (T, 3) of the targets in the frame of the submap before the newest."""

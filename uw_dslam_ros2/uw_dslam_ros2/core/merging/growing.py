@@ -82,8 +82,7 @@ class _GrowingPlanner:
         return Plan(wanted, settled, self._library.odometry.edges, components)
 
     def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
-        unique = list({joint.key: joint for joint in joints}.values())
-        return self._library.settle(self._anchor, unique, self._config.inlier_probability)
+        return self._library.settle(self._anchor, joints, self._config.inlier_probability)
 
     def _apart(self, components: Sequence[Component]) -> list[Pair]:
         """The best pairs of vehicles of different components, the most promising first."""

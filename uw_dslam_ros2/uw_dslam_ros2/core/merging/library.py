@@ -186,10 +186,12 @@ class Library:
         self, anchor: SubmapId, joints: Sequence[Joint], inlier_probability: float
     ) -> tuple[list[Joint], list[Component]]:
         """Solve the pose graph; see `settling.settle`."""
-        key = ("graph", self._state, anchor, tuple(sorted(joint.key for joint in joints)))
-        edges = self.odometry.edges
+        # One answer may serve several matches; it is one edge.
+        unique = {joint.key: joint for joint in joints}
+        key = ("graph", self._state, anchor, tuple(sorted(unique)))
+        edges, own = self.odometry.edges, list(unique.values())
         return self._remember(
-            key, lambda: settle(self.submaps, anchor, edges, joints, inlier_probability)
+            key, lambda: settle(self.submaps, anchor, edges, own, inlier_probability)
         )
 
     def _odometry_unit(self, ids: Sequence[SubmapId], reference: SubmapId | None = None) -> Unit:

@@ -242,9 +242,7 @@ class _Planner:
         return key
 
     def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
-        # One answer may serve several matches; it is one edge.
-        unique = list({joint.key: joint for joint in joints}.values())
-        return self._library.settle(self._anchor, unique, self._config.inlier_probability)
+        return self._library.settle(self._anchor, joints, self._config.inlier_probability)
 
 
 def most_promising(ranked: Sequence[tuple[str, str]], max_partners: int) -> list[tuple[str, str]]:

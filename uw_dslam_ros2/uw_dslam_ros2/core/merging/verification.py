@@ -27,11 +27,11 @@ from uw_dslam_ros2.core.merging.voting import ENOUGH_ODDS, Vote, vote_of, weigh
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["WORTH_CHECKING", "Verifier"]
+__all__ = ["Verifier", "is_worth_checking"]
 
 FloatArray = NDArray[np.float64]
 
-WORTH_CHECKING = 0.5
+_WORTH_CHECKING = 0.5
 """A match that was refused as not sure enough is still checked if it is this likely."""
 _NUM_ROUNDS = 3
 """Where the first checks leave it open, as many again are asked at other places."""
@@ -220,7 +220,7 @@ class Verifier:
 
 def is_worth_checking(answer: Answer) -> bool:
     """Whether an answer may be right: accepted, or not far from it."""
-    is_likely = answer.is_accepted or answer.probability >= WORTH_CHECKING
+    is_likely = answer.is_accepted or answer.probability >= _WORTH_CHECKING
     return answer.is_guess and is_likely
 
 

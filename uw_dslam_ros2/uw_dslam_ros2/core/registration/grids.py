@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence, clean_cells, coarsen
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.registration.grid_candidates import (
-    merge_best,
-    scan_candidates,
-)
+from uw_dslam_ros2.core.registration.grid_candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grid_evidence import Found, weigh
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow, build_problem
@@ -25,10 +22,7 @@ from uw_dslam_ros2.core.registration.grid_search import (
     whole_plane,
 )
 from uw_dslam_ros2.core.registration.paper_grids import register_grids_by_points
-from uw_dslam_ros2.core.registration.refine_grids import (
-    WallMap,
-    pose_covariance,
-)
+from uw_dslam_ros2.core.registration.refine_grids import WallMap, pose_covariance
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
     Progress,
@@ -176,8 +170,7 @@ class _GridMatch:
             return None
         levels, walls = prepared
         window = self._window(levels[0])
-        candidates, chance = scan_candidates(levels[0], window)
-        found = weigh(walls, levels, window, candidates, chance)
+        found = weigh(walls, levels, window, *scan_candidates(levels[0], window))
         return found.evidence, self._to_frame(levels[-1].to_motion(found.refined[0].pose))
 
     def _prepare(self) -> tuple[list[GridProblem], tuple[WallMap, WallMap]] | str:

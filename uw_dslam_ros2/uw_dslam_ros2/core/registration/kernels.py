@@ -52,30 +52,23 @@ def _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells):
     right, top = terms[t, 5] - 1.0, terms[t, 4] - 1.0
     tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
     bow *= 0.5
-    c, s, stay = cos * scale, sin * scale, 1.0 - bow
-    xs, ys = points[0, first:end], points[1, first:end]
-    low_x, low_y, high_x, high_y = cells[0], cells[1], cells[2], cells[3]
     if terms[t, 2] != 0:
-        # The box of translations is turned, too.
+        # The box of translations is turned, too, the other way round.
+        origin_x, origin_y, sin = tx, ty, -sin
         e_x = scale * (abs(cos) * h_x + abs(sin) * h_y)
         e_y = scale * (abs(sin) * h_x + abs(cos) * h_y)
         reach_x = e_x * (1.0 + 2.0 * bow) + swing * e_y + rounding
         reach_y = e_y * (1.0 + 2.0 * bow) + swing * e_x + rounding
-        for k in range(end - first):
-            x, y = xs[k] - tx, ys[k] - ty
-            rx, ry = c * x + s * y, c * y - s * x
-            u, v = stay * rx + shift_x, stay * ry + shift_y
-            half_x = reach_x + swing * abs(ry) + bow * abs(rx)
-            half_y = reach_y + swing * abs(rx) + bow * abs(ry)
-            low_x[k] = np.int32(min(max(u - half_x, 0.0), right))
-            low_y[k] = np.int32(min(max(v - half_y, 0.0), top))
-            high_x[k] = np.int32(min(max(u + half_x, 0.0), right))
-            high_y[k] = np.int32(min(max(v + half_y, 0.0), top))
-        return
-    shift_x, shift_y = shift_x + scale * tx, shift_y + scale * ty
-    reach_x, reach_y = scale * h_x + rounding, scale * h_y + rounding
+    else:
+        origin_x, origin_y = 0.0, 0.0
+        shift_x, shift_y = shift_x + scale * tx, shift_y + scale * ty
+        reach_x, reach_y = scale * h_x + rounding, scale * h_y + rounding
+    c, s, stay = cos * scale, sin * scale, 1.0 - bow
+    xs, ys = points[0, first:end], points[1, first:end]
+    low_x, low_y, high_x, high_y = cells[0], cells[1], cells[2], cells[3]
     for k in range(end - first):
-        rx, ry = c * xs[k] - s * ys[k], s * xs[k] + c * ys[k]
+        x, y = xs[k] - origin_x, ys[k] - origin_y
+        rx, ry = c * x - s * y, s * x + c * y
         u, v = stay * rx + shift_x, stay * ry + shift_y
         half_x = reach_x + swing * abs(ry) + bow * abs(rx)
         half_y = reach_y + swing * abs(rx) + bow * abs(ry)
