@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy import fft
 
@@ -177,16 +178,16 @@ class _Scan:
         return fft.irfft2(product, s=self._shape)
 
 
+@njit(cache=True, nogil=True)
 def _splat(image: NDArray[np.float32], points: FloatArray, weights: FloatArray) -> None:
-    """Add weights to the four cells around each point [x, y] (N, 2)."""
-    base = np.floor(points).astype(np.int64)
-    fx, fy = (points - base).T
-    width = image.shape[1]
-    index = base[:, 1] * width + base[:, 0]
-    for step, share in (
-        (0, (1 - fx) * (1 - fy)), (1, fx * (1 - fy)), (width, (1 - fx) * fy), (width + 1, fx * fy),
-    ):  # fmt: skip
-        image += np.bincount(index + step, share * weights, image.size).reshape(image.shape)
+    """Add weights to the four cells around each point [x, y] (N, 2), all inside the image."""
+    for k in range(points.shape[0]):
+        col, row = math.floor(points[k, 0]), math.floor(points[k, 1])
+        fx, fy = points[k, 0] - col, points[k, 1] - row
+        image[row, col] += weights[k] * (1.0 - fx) * (1.0 - fy)
+        image[row, col + 1] += weights[k] * fx * (1.0 - fy)
+        image[row + 1, col] += weights[k] * (1.0 - fx) * fy
+        image[row + 1, col + 1] += weights[k] * fx * fy
 
 
 def _peaks(scores: NDArray[np.float32]) -> list[tuple[int, int, float]]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence
@@ -63,23 +65,33 @@ def signed_field(
     """
     if distance is None:
         distance = wall_distance(cells)
-    near = np.exp(np.square(distance) * np.float32(-0.5 / sigma_cells**2))
     free = cv2.boxFilter(cells.free, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
-    field = near - np.float32(free_penalty) * free * (np.float32(1.0) - near)
     # Nothing is known beyond the edge of a map, not even that a wall's kernel reaches there.
-    if stride > 1:
-        field = _decimate(field, stride)
-    return SignedField(np.pad(field, PAD).astype(np.float32))
+    return SignedField(_padded_means(distance, free, sigma_cells, free_penalty, stride, PAD))
 
 
-def _decimate(field: FloatGrid, stride: int) -> FloatGrid:
-    """Mean over ``stride`` x ``stride`` cells; the last ones are filled with zeros."""
-    rows, cols = (-(-size // stride) * stride for size in field.shape)
-    padded = np.zeros((rows, cols), np.float32)
-    padded[: field.shape[0], : field.shape[1]] = field
-    blocks = padded.reshape(rows // stride, stride, cols // stride, stride)
-    mean: FloatGrid = blocks.mean(axis=(1, 3)).astype(np.float32)
-    return mean
+@njit(cache=True, nogil=True)
+def _padded_means(
+    distance: FloatGrid, free: FloatGrid, sigma: float, penalty: float, stride: int, pad: int
+) -> FloatGrid:
+    """Means of the field over ``stride`` x ``stride`` cells; what is outside counts as zero."""
+    num_rows, num_cols = distance.shape
+    rows, cols = -(-num_rows // stride), -(-num_cols // stride)
+    result = np.zeros((rows + 2 * pad, cols + 2 * pad), np.float32)
+    reach, scale = 6.0 * sigma, -0.5 / sigma**2
+    for i in range(rows):
+        for j in range(cols):
+            total = 0.0
+            for row in range(i * stride, min((i + 1) * stride, num_rows)):
+                for col in range(j * stride, min((j + 1) * stride, num_cols)):
+                    d = distance[row, col]
+                    if d < reach:
+                        near = math.exp(scale * d * d)
+                        total += near - penalty * free[row, col] * (1.0 - near)
+                    else:  # the kernel is below the precision of the field
+                        total -= penalty * free[row, col]
+            result[pad + i, pad + j] = total / (stride * stride)
+    return result
 
 
 def layer_lookup() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
