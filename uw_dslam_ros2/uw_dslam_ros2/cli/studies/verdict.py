@@ -39,6 +39,7 @@ from uw_dslam_ros2.core.registration.verdict import (
     match_features,
     pose_features,
     probability_of,
+    rival_probability,
 )
 
 FloatArray = NDArray[np.float64]
@@ -106,10 +107,7 @@ def _specs(kinds: Iterable[str], overlaps: Iterable[float], seeds: range) -> Ite
                     is_sonar = kind in _WATERS and rng.random() < 0.35
                     size = int(rng.choice(_SIZES))
                     other = rng.random() < 0.6
-                    # Where windows of a symmetric place share little, its half turn fits better
-                    # than the truth, and nothing in the maps can tell.
-                    if kind != "symmetric" or overlap >= 0.5:
-                        yield PairSpec(kind, overlap, noise, seed, True, is_sonar, False, size)
+                    yield PairSpec(kind, overlap, noise, seed, True, is_sonar, False, size)
                     if other:
                         is_twin = kind == "basin"
                         yield PairSpec(kind, overlap, noise, seed, False, is_sonar, is_twin, size)
@@ -143,15 +141,16 @@ def _gathered(path: Path, specs: Iterable[PairSpec]) -> list[_Trial]:
 def _fitted(trials: list[_Trial]) -> VerdictModels:
     """Both models, one after the other.
 
-    A pose in a symmetric place is convincing for itself wherever it is, so such places teach the
-    second model only.
+    A pose in a symmetric place is convincing for itself wherever it is: there, rivals decide. The
+    second model is of the matches that no convincing rival makes ambiguous anyway.
     """
     plain = [t for t in trials if t.spec.kind != "symmetric"]
     features = [pose_features(t.evidence.best, t.evidence.log_volume) for t in plain]
     pose = _logistic(features, plain)
-    return VerdictModels(
-        pose, _logistic([match_features(t.evidence, pose) for t in trials], trials)
-    )
+    alone = VerdictModels(pose, (0.0, 1.0, 0.0))
+    limit = GridRegistrationConfig().max_rival_probability
+    left = [t for t in trials if rival_probability(t.evidence, alone) <= limit]
+    return VerdictModels(pose, _logistic([match_features(t.evidence, pose) for t in left], left))
 
 
 def _logistic(rows: list[tuple[float, ...]], trials: list[_Trial]) -> tuple[float, ...]:

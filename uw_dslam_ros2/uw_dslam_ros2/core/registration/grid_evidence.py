@@ -19,7 +19,7 @@ from uw_dslam_ros2.core.registration.refine_grids import (
 from uw_dslam_ros2.core.registration.verdict import MatchEvidence, PoseEvidence
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["Found", "weigh"]
+__all__ = ["Found", "Judge", "is_same_pose", "refine", "weigh"]
 
 FloatArray = NDArray[np.float64]
 _NUM_REFINED = 8
@@ -29,10 +29,35 @@ _SAME_CELLS = 8.0  # poses nearer than that, on the finest level, are one answer
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Poses of the finest level, best first, and the evidence."""
+    """Poses of the finest level, best first, the evidence, and what chance reaches."""
 
     refined: list[Candidate]
     evidence: MatchEvidence
+    chance: Chance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judge:
+    """What two maps say about one pose after the other.
+
+    ``levels`` are problems from the searched lattice to the finest one; ``sides`` are source and
+    target on the finest; ``best_score`` is what shares of scores are of.
+    """
+
+    sides: tuple[WallMap, WallMap]
+    levels: list[GridProblem]
+    chance: Chance
+    best_score: float
+
+    def evidence(self, candidate: Candidate) -> PoseEvidence:
+        """Evidence for a pose of the finest level."""
+        work, finest = self.levels[0], self.levels[-1]
+        T_grids = finest.to_motion(candidate.pose)
+        scale = 1.0 / finest.resolution_m
+        T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
+        share = candidate.score / self.best_score if self.best_score > 0.0 else 1.0
+        surprise = self.chance.surprise(work.value(work.to_pose(T_grids)))
+        return PoseEvidence(measure_agreement(*self.sides, T_cells), share, surprise)
 
 
 def weigh(
@@ -44,45 +69,37 @@ def weigh(
 ) -> Found:
     """Refine candidates of the searched lattice on the finest one, and compare them.
 
-    ``levels`` are problems from the searched lattice to the finest one; ``sides`` are source and
-    target on the finest.
+    ``sides`` and ``levels`` as for `Judge`.
     """
-    work, finest = levels[0], levels[-1]
-    refined = _apart(finest, _refine(levels, candidates))
+    finest = levels[-1]
+    refined = refine(levels, candidates, _NUM_REFINED)
     best = refined[0]
-    poses = []
-    for candidate in refined:
-        T_grids = finest.to_motion(candidate.pose)
-        scale = 1.0 / finest.resolution_m
-        T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
-        share = candidate.score / best.score if best.score > 0.0 else 1.0
-        surprise = chance.surprise(work.value(work.to_pose(T_grids)))
-        poses.append(PoseEvidence(measure_agreement(sides[0], sides[1], T_cells), share, surprise))
+    refined = [best, *(c for c in refined[1:] if not is_same_pose(finest, c.pose, best.pose))]
+    judge = Judge(sides, levels, chance, best.score)
+    poses = [judge.evidence(candidate) for candidate in refined]
     evidence = MatchEvidence(
         best=poses[0],
         rivals=tuple(poses[1:]),
         slide_share=slide_share(finest, best.pose, _SLIDE_CELLS),
-        log_volume=log_volume(work, window),
+        log_volume=log_volume(levels[0], window),
     )
-    return Found(refined, evidence)
+    return Found(refined, evidence, chance)
 
 
-def _refine(levels: list[GridProblem], candidates: list[Candidate]) -> list[Candidate]:
-    """The candidates' maxima on the finest level, best first."""
-    refined = candidates[:_NUM_REFINED]
+def refine(levels: list[GridProblem], candidates: list[Candidate], limit: int) -> list[Candidate]:
+    """The maxima of the best candidates on the finest level, best first.
+
+    All climb on the first finer level, whose scores rank them far better; ``limit`` go on.
+    """
+    refined = candidates
     for coarse, fine in itertools.pairwise(levels):
         poses = [fine.to_pose(coarse.to_motion(c.pose)) for c in refined]
-        refined = climb(fine, np.array(poses))
-    return refined
+        refined = climb(fine, np.array(poses))[:limit]
+    return refined[:limit]
 
 
-def _apart(problem: GridProblem, refined: list[Candidate]) -> list[Candidate]:
-    """The best one, and those that are other answers than it."""
-    best = refined[0].pose
-    others = []
-    for candidate in refined[1:]:
-        offset = candidate.pose - best
-        turn = abs(wrap_angle(float(offset[0]))) * problem.radius
-        if turn > _SAME_CELLS or math.hypot(offset[1], offset[2]) > _SAME_CELLS:
-            others.append(candidate)
-    return [refined[0], *others]
+def is_same_pose(problem: GridProblem, pose: FloatArray, other: FloatArray) -> bool:
+    """Whether two poses (3,) of the finest level are one answer."""
+    offset = pose - other
+    turn = abs(wrap_angle(float(offset[0]))) * problem.radius
+    return turn <= _SAME_CELLS and math.hypot(offset[1], offset[2]) <= _SAME_CELLS

@@ -21,6 +21,7 @@ from uw_dslam_ros2.core.registration.grid_search import (
     search_poses,
     whole_plane,
 )
+from uw_dslam_ros2.core.registration.grid_symmetry import add_twins
 from uw_dslam_ros2.core.registration.paper_grids import register_grids_by_points
 from uw_dslam_ros2.core.registration.refine_grids import WallMap, pose_covariance
 from uw_dslam_ros2.core.registration.result import (
@@ -30,7 +31,7 @@ from uw_dslam_ros2.core.registration.result import (
     Rival,
     Verdict,
 )
-from uw_dslam_ros2.core.registration.verdict import MatchEvidence, decide
+from uw_dslam_ros2.core.registration.verdict import MatchEvidence, decide, probability_of
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["GridRegistrationConfig", "match_evidence", "register_grids"]
@@ -43,6 +44,7 @@ _FINE_SIGMA_CELLS = 2.0
 _LEAST_SIDE_CELLS = 4
 _NUM_BOXES_OF_REFUSED = 20_000
 _RIVAL_SHARE = 0.5
+_LOOK_FOR_TWINS = 0.5
 _LEAST_RESIDUAL_CELLS = 0.45
 
 
@@ -161,7 +163,7 @@ class _GridMatch:
         if outcome.lower_bound > candidates[0].score * (1.0 + 1e-6):
             candidates = merge_best(levels[0], candidates, outcome)
             found = weigh(walls, levels, window, candidates, chance)
-        return self._answer(levels, outcome, found)
+        return self._answer(levels, outcome, _with_twins(found, walls, levels))
 
     def collect(self) -> tuple[MatchEvidence, SE2] | None:
         """Evidence for the best pose, and the pose; None where a map holds too little."""
@@ -171,6 +173,7 @@ class _GridMatch:
         levels, walls = prepared
         window = self._window(levels[0])
         found = weigh(walls, levels, window, *scan_candidates(levels[0], window))
+        found = _with_twins(found, walls, levels)
         return found.evidence, self._to_frame(levels[-1].to_motion(found.refined[0].pose))
 
     def _prepare(self) -> tuple[list[GridProblem], tuple[WallMap, WallMap]] | str:
@@ -375,6 +378,13 @@ class _GridMatch:
             num_source_points=0,
             num_target_points=0,
         )
+
+
+def _with_twins(found: Found, walls: tuple[WallMap, WallMap], levels: list[GridProblem]) -> Found:
+    """Symmetries only matter to a match that would be convincing without them."""
+    if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_TWINS:
+        return found
+    return add_twins(found, walls, levels)
 
 
 def _too_little(

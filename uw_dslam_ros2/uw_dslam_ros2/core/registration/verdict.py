@@ -20,7 +20,9 @@ __all__ = [
     "decide",
     "match_features",
     "pose_features",
+    "pose_logit",
     "probability_of",
+    "rival_probability",
 ]
 
 
@@ -123,6 +125,22 @@ def probability_of(
     return 1.0 / (1.0 + math.exp(-logit))
 
 
+def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MODELS) -> float:
+    """Logit that a pose is right, from what speaks for it by itself."""
+    return _logit(models.pose, pose_features(pose, log_volume))
+
+
+def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
+    """How probable the most convincing rival would be if the best pose were not there."""
+    return max(
+        (
+            probability_of(replace(evidence, best=rival), models, is_alone=True)
+            for rival in evidence.rivals
+        ),
+        default=0.0,
+    )
+
+
 def _logit(model: Sequence[float], features: Sequence[float]) -> float:
     logit = model[0] + sum(c * x for c, x in zip(model[1:], features, strict=True))
     return max(-_MOST_LOGIT, min(_MOST_LOGIT, logit))
@@ -156,11 +174,17 @@ def decide(
         return Verdict.CONTRADICTED, reason, probability
     # Rivals only matter to an alignment that would be convincing without them.
     alone = probability_of(evidence, models, is_alone=True)
-    is_rivalled = evidence.rival_share > config.max_rival_share or not is_probable
+    rival = rival_probability(evidence, models)
+    is_rivalled = (
+        evidence.rival_share > config.max_rival_share
+        or rival > config.max_rival_probability
+        or not is_probable
+    )
     if is_rivalled and alone >= config.min_probability:
         reason = (
-            f"another pose reaches {evidence.rival_share:.0%} of the best score and agrees as "
-            f"well where it overlaps: right with probability {probability:.2f} only"
+            f"another pose agrees as well where it overlaps: it would be right with probability "
+            f"{rival:.2f} if this one were not there; best score of another: "
+            f"{evidence.rival_share:.0%} of this one's"
         )
         return Verdict.AMBIGUOUS, reason, min(probability, 0.5)
     numbers = (
