@@ -196,3 +196,15 @@ def test_points_spread_over_four_cells_keep_weight_and_place():
     index = np.arange(20)
     place = [(image.sum(axis=0) * index).sum(), (image.sum(axis=1) * index).sum()]
     np.testing.assert_allclose(place, weights @ points, rtol=1e-4)
+
+
+def test_a_stopped_search_tells_where_it_did_not_look(problem):
+    window = PoseWindow(np.array([0.3, 10.0, 10.0]), np.array([1.5, 8.0, 8.0]))
+    stopped = grid_search.search_poses(
+        problem, window, window.middle, grid_search.SearchLimits(0.02, 1000)
+    )
+    assert not stopped.is_complete
+    assert 0 < len(stopped.open_poses) <= 64
+    offset = np.abs(stopped.open_poses - window.middle)
+    assert (offset <= window.half + 1e-9).all()
+    assert len(_search(problem, window, 0.05).open_poses) == 0

@@ -64,6 +64,25 @@ def test_unequal_resolutions_give_the_same_motion(harbour, sides):
     assert degrees < 1.0
 
 
+def _enlarged(occupancy: OccupancyMap, side: int) -> OccupancyMap:
+    spec = occupancy.spec
+    values = np.repeat(np.repeat(occupancy.values, side, axis=0), side, axis=1)
+    fine = GridSpec(spec.resolution_m / side, *values.shape, spec.T_frame_grid)
+    return OccupancyMap(fine, values)
+
+
+@pytest.mark.parametrize("sides", [(4, 4), (5, 1), (1, 8)])
+def test_enlarged_cells_change_nothing(harbour, sides):
+    plain = register_grids(harbour.source, harbour.target)
+    large = register_grids(
+        _enlarged(harbour.source, sides[0]), _enlarged(harbour.target, sides[1])
+    )
+    assert (large.verdict, large.num_boxes) == (plain.verdict, plain.num_boxes)
+    distance_m, angle_rad = large.T_target_source.distance_to(plain.T_target_source)
+    assert distance_m < 1e-6
+    assert angle_rad < 1e-6
+
+
 def test_rotated_origins_only_change_the_frames(harbour):
     T_new_source, T_new_target = SE2(3.0, 4.0, 1.1), SE2(-7.0, 2.0, -2.0)
     plain = register_grids(harbour.source, harbour.target)
@@ -163,3 +182,15 @@ def test_hopeless_maps_get_a_sentence(values):
         result = register_grids(source, target)
         assert result.verdict is Verdict.TOO_FEW_FEATURES
         assert "map" in result.reason
+
+
+def test_an_accepted_match_says_where_its_proof_is_open(harbour):
+    config = GridRegistrationConfig(max_boxes=1000, gap=0.001)
+    result = register_grids(harbour.source, harbour.target, config)
+    assert result.verdict is Verdict.ACCEPTED
+    assert not result.is_certified
+    assert result.gap > config.gap
+    assert f"with a gap of {result.gap:.0%}" in result.reason
+    strict = GridRegistrationConfig(max_boxes=1000, gap=0.001, is_proof_required=True)
+    refused = register_grids(harbour.source, harbour.target, strict)
+    assert refused.verdict is Verdict.BUDGET_EXHAUSTED

@@ -63,10 +63,11 @@ def climb(problem: GridProblem, poses: FloatArray) -> list[Candidate]:
 def merge_best(
     problem: GridProblem, candidates: list[Candidate], outcome: SearchOutcome
 ) -> list[Candidate]:
-    """Candidates with the best pose of a search in front."""
-    merged = [Candidate(outcome.pose, outcome.lower_bound), *candidates]
+    """Candidates with the best pose of a search, and what is in the boxes that it left open."""
+    found = [Candidate(outcome.pose, outcome.lower_bound), *climb(problem, outcome.open_poses)]
+    merged = sorted([*found, *candidates], key=lambda c: -c.score)
     stacked = np.array([c.pose for c in merged])
-    return [merged[k] for k in distinct(stacked, problem.radius, 1.0, len(merged))]
+    return [merged[k] for k in distinct(stacked, problem.radius, 1.0, _NUM_CANDIDATES)]
 
 
 def log_volume(problem: GridProblem, window: PoseWindow) -> float:

@@ -36,6 +36,7 @@ _FINE_FROM_HALF_CELLS = 2.0
 _SMOOTH_FROM_HALF_CELLS = 0.5
 _SMALLEST_HALF_CELLS = 0.01
 _CHUNK = 2048
+_NUM_OPEN_POSES = 64
 _OCTANTS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
 
 
@@ -50,7 +51,10 @@ class SearchLimits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchOutcome:
-    """Best pose (3,) and proven bounds on the objective's maximum over the window."""
+    """Best pose (3,) and proven bounds on the objective's maximum over the window.
+
+    ``open_poses`` (K, 3) are the middles of the most promising boxes that a stopped search left.
+    """
 
     pose: FloatArray
     lower_bound: float
@@ -58,6 +62,7 @@ class SearchOutcome:
     is_complete: bool
     is_stopped: bool  # by the question, not by the number of boxes
     num_boxes: int
+    open_poses: FloatArray
 
 
 def whole_plane(problem: GridProblem) -> PoseWindow:
@@ -121,6 +126,7 @@ class _Search:
         self._dropped = -math.inf  # greatest bound of a dropped box
         self._num_boxes = 0
         self._is_stopped = False
+        self._open_poses = np.empty((0, 3))
 
     def _kernel_arguments(
         self, values: list[TableArray], curvature: list[TableArray], scale: float
@@ -169,6 +175,10 @@ class _Search:
                 rest = float(parents[first:].max())
                 open_bounds = [float(b.max(initial=-math.inf)) for b in kept_bounds]
                 self._dropped = max(self._dropped, rest, *open_bounds)
+                self._leave(
+                    np.concatenate([*kept_boxes, boxes[first:]]),
+                    np.concatenate([*kept_bounds, parents[first:]]),
+                )
                 return None
             bounds, values = grid_kernels.bound_boxes(
                 boxes[chunk], parents[chunk], half_rad, half, self._threshold, is_smooth,
@@ -185,6 +195,11 @@ class _Search:
         bounds = np.concatenate(kept_bounds)
         order = np.argsort(-bounds, kind="stable")
         return np.concatenate(kept_boxes)[order], bounds[order]
+
+    def _leave(self, boxes: FloatArray, bounds: FloatArray) -> None:
+        """Keep the most promising of the boxes that nothing is known of, for others to look at."""
+        order = np.argsort(-bounds, kind="stable")[:_NUM_OPEN_POSES]
+        self._open_poses = boxes[order]
 
     def _improve(self, boxes: FloatArray, values: FloatArray) -> None:
         index = int(values.argmax())
@@ -206,8 +221,9 @@ class _Search:
     def _outcome(self, is_complete: bool) -> SearchOutcome:
         upper = min(max(self._best, self._dropped), 1.0)
         return SearchOutcome(
-            self._pose, self._best, upper, is_complete, self._is_stopped, self._num_boxes
-        )
+            self._pose, self._best, upper, is_complete, self._is_stopped, self._num_boxes,
+            self._open_poses,
+        )  # fmt: skip
 
 
 def _roots(window: PoseWindow, radius: float) -> tuple[FloatArray, float, float]:

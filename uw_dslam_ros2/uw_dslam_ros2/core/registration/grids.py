@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence, clean_cells, coarsen
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grid_candidates import merge_best, scan_candidates
@@ -86,6 +87,7 @@ def register_grids(
         Where a prior's widths are not positive.
     """
     config = config or GridRegistrationConfig()
+    source, target = shrink_blocks(source), shrink_blocks(target)
     if config.method == "paper":
         return register_grids_by_points(
             source, target, config,
@@ -106,7 +108,8 @@ def match_evidence(
 
     None where a map holds too little to be matched.
     """
-    match = _GridMatch(source, target, config or GridRegistrationConfig(), prior, None)
+    maps = shrink_blocks(source), shrink_blocks(target)
+    match = _GridMatch(*maps, config or GridRegistrationConfig(), prior, None)
     return match.collect()
 
 
@@ -160,7 +163,9 @@ class _GridMatch:
         outcome = self._certify(
             levels[0], window, candidates[0].pose, num_boxes, progress, is_cancelled
         )
-        if outcome.lower_bound > candidates[0].score * (1.0 + 1e-6):
+        is_better = outcome.lower_bound > candidates[0].score * (1.0 + 1e-6)
+        if is_better or (verdict is Verdict.ACCEPTED and not outcome.is_complete):
+            # Where the proof is open, the poses that it could not exclude are rivals like others.
             candidates = merge_best(levels[0], candidates, outcome)
             found = weigh(walls, levels, window, candidates, chance)
         return self._answer(levels, outcome, _with_twins(found, walls, levels))
