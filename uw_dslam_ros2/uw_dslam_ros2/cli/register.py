@@ -121,9 +121,12 @@ def _lines(result: RegistrationResult) -> list[str]:
     motion = result.T_target_source
     sigma_x, sigma_y, sigma_yaw = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))
     note = "" if result.is_accepted else "   (refused: the best guess, not to be used)"
+    certainty = ""
+    if result.is_accepted:
+        certainty = ", certified" if result.is_certified else ", NOT certified"
     proof = "complete" if result.is_certified else "NOT complete"
     lines = [
-        f"{result.verdict.name}: {result.reason}",
+        f"{result.verdict.name}{certainty}: {result.reason}",
         f"T_B_A: x {motion.x:.3f} m, y {motion.y:.3f} m, "
         f"yaw {motion.yaw:.5f} rad ({math.degrees(motion.yaw):.2f} degrees){note}",
         f"standard deviations: x {sigma_x:.3f} m, y {sigma_y:.3f} m, yaw {sigma_yaw:.5f} rad",
