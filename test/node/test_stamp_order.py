@@ -84,3 +84,25 @@ def test_jump_back_is_judged_for_each_stream():
     assert order.has_jumped_back("imu", 899)
     order.clear()
     assert not order.has_jumped_back("imu", 899)
+
+
+def test_expected_stream_is_waited_for_from_the_start_on():
+    order = StampOrder(hold_ns=100, jump_ns=50)
+    order.expect("dvl", 1000)
+    order.add("imu", 1000, "a")
+    order.add("imu", 1099, "b")
+    assert drained(order) == ["a"]
+    assert not order.has_jumped_back("dvl", 900)  # its first, however early
+    order.add("dvl", 1050, "c")
+    assert drained(order) == ["c"]
+    order.expect("imu", 5000)  # heard of already: nothing changes
+    order.add("dvl", 1100, "d")
+    assert drained(order) == ["b"]
+
+
+def test_expected_stream_that_never_comes_is_given_up():
+    order = StampOrder(hold_ns=100, jump_ns=50)
+    order.expect("dvl", 1000)
+    order.add("imu", 1000, "a")
+    order.add("imu", 1101, "b")
+    assert drained(order) == ["a", "b"]

@@ -147,6 +147,18 @@ def test_too_late_is_counted_and_changes_nothing():
     assert navigation.pose_at(20 * S)[0] == before
 
 
+def test_too_late_by_its_kind_alone_is_counted_too():
+    navigation = NavigationFilter(NavigationConfig(horizon_s=0.5))
+    for i in range(200):
+        navigation.add_velocity(i * S // 10, (1.0, 0.0))
+    before = navigation.pose_at(20 * S)[0]
+    # A yaw comes before a velocity of its stamp, so at the oldest stamp that is kept it is late.
+    for i in range(200):
+        navigation.add_yaw(i * S // 10, 0.0)
+    assert navigation.num_late > 0
+    assert navigation.pose_at(20 * S)[0].distance_to(before)[0] < 0.5
+
+
 def test_the_same_message_twice_is_still_a_valid_filter():
     navigation = NavigationFilter()
     for i in range(50):

@@ -34,6 +34,7 @@ class StampOrder[ItemT]:
         self._heap: list[tuple[int, int, ItemT]] = []
         self._newest_of_stream: dict[str, int] = {}
         self._alive: set[str] = set()
+        self._unheard: set[str] = set()
         self._released_ns: int | None = None
 
     def __len__(self) -> int:
@@ -47,11 +48,23 @@ class StampOrder[ItemT]:
     def has_jumped_back(self, stream: str, stamp_ns: int) -> bool:
         """Whether this stamp shows that a recording began again."""
         newest_ns = self._newest_of_stream.get(stream)
-        return newest_ns is not None and stamp_ns < newest_ns - self._jump_ns
+        if newest_ns is None or stream in self._unheard:
+            return False
+        return stamp_ns < newest_ns - self._jump_ns
+
+    def expect(self, stream: str, stamp_ns: int) -> None:
+        """Wait for a stream that is about to begin as for one that has come so far."""
+        if stream not in self._newest_of_stream:
+            self._newest_of_stream[stream] = stamp_ns
+            self._unheard.add(stream)
+            self._alive.add(stream)
 
     def advance(self, stream: str, stamp_ns: int) -> None:
         """Note that a stream has come so far, without an item."""
-        self._newest_of_stream[stream] = max(self._newest_of_stream.get(stream, 0), stamp_ns)
+        is_first = stream in self._unheard
+        newest_ns = 0 if is_first else self._newest_of_stream.get(stream, 0)
+        self._newest_of_stream[stream] = max(newest_ns, stamp_ns)
+        self._unheard.discard(stream)
         self._alive.add(stream)
 
     def add(self, stream: str, stamp_ns: int, item: ItemT) -> None:

@@ -182,7 +182,7 @@ class NavigationFilter:
         if self._early is not None:
             self._add_early(key, event)
             return
-        if key[0] < self._records[0].key[0]:
+        if key < self._records[0].key:
             self.num_late += 1
             return
         position = bisect.bisect_right(self._records, key, key=lambda record: record.key)
