@@ -178,6 +178,19 @@ def test_room_becomes_map_submap_odometry_and_frames(ros_context, spinning):
     assert len(vehicle.paths[-1].poses) == 20
 
 
+def test_replay_faster_than_time_draws_few_maps_and_the_last_one(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context, map_period_s=3600.0)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        drive(until, vehicle, range(4))
+        until(lambda: vehicle.values().get("num_scan") == "8", "all scans")
+        assert finish(until, vehicle).success
+        until(lambda: vehicle.paths and len(vehicle.paths[-1].poses) == 8, "the last path")
+    # One with the first ping, one where the idle timer may have come in, one at the end.
+    assert 1 <= len(vehicle.maps) <= 3
+
+
 def test_mounts_may_come_after_the_first_messages(ros_context, spinning):
     vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
     with spinning(mapper, vehicle.node) as until:

@@ -82,6 +82,14 @@ def num_processors() -> int:
     return len(os.sched_getaffinity(0))
 
 
+def num_workers(num_jobs: int) -> int:
+    """Processes for jobs of about the same length.
+
+    Up to two a processor: three jobs on two processors, one each, would take as long as four.
+    """
+    return max(1, min(num_jobs, 2 * num_processors()))
+
+
 def versions() -> dict[str, str]:
     """Versions of what computes."""
     found = {"uw_dslam_ros2": uw_dslam_ros2.__version__, "python": platform.python_version()}

@@ -43,7 +43,7 @@ _FINISH_TIMEOUT_S = 300.0
 _SETTLE_TIMEOUT_S = 600.0
 # As fast as the mappers keep up: the player holds when one is this far behind, in recorded time.
 _UNLIMITED_RATE = 10_000.0
-_CLOCK_HZ = 5.0
+_CLOCK_HZ = 2.0
 _MAX_LAG_S = 4.0
 
 

@@ -11,7 +11,7 @@ from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any
 
-from uw_dslam_ros2.cli.common import num_processors
+from uw_dslam_ros2.cli.common import num_processors, num_workers
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.submap import Submap
@@ -99,9 +99,9 @@ def map_bags(
     for bag in bags:
         with open_bag(bag) as reader:
             total += sum(reader.message_counts.values())
-    num_workers = min(num_processors(), len(bags))
+    num_processes = num_workers(len(bags))
     with ProcessPoolExecutor(
-        num_workers, mp_context=context, initializer=_share, initargs=(done,)
+        num_processes, mp_context=context, initializer=_share, initargs=(done,)
     ) as pool:
         futures = []
         for bag in bags:
@@ -116,7 +116,7 @@ def map_bags(
         except BrokenProcessPool as error:
             raise DataError(
                 "a mapping process was ended from outside; is there enough memory for "
-                f"{num_workers} vehicles at a time?"
+                f"{num_processes} vehicles at a time?"
             ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)

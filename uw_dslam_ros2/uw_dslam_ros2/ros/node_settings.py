@@ -54,7 +54,9 @@ class SonarMapperConfig(Config):
     jump_back_s: float = setting(
         1.0, 0.01, 1e6, "stamps that go back by more begin a new recording: all starts afresh [s]"
     )
-    map_period_s: float = setting(2.0, 0.1, 3600.0, "between two maps, by the pings' stamps [s]")
+    map_period_s: float = setting(
+        2.0, 0.1, 3600.0, "between two maps, by the pings' stamps and by a steady clock [s]"
+    )
     path_max_poses: int = setting(2000, 2, 1000000, "a longer path is thinned when published")
 
 

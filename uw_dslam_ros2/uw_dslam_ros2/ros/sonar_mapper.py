@@ -40,6 +40,7 @@ from uw_dslam_ros2.ros.conversions import (
     submap_to_msg,
 )
 from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.draining import subscribe_draining
 from uw_dslam_ros2.ros.frames import (
     WARNING_PERIOD_S,
     FrameBroadcaster,
@@ -61,6 +62,7 @@ _MOUNT_PATIENCE_NS = 5_000_000_000
 _ODOM_PERIOD_NS = 100_000_000
 _FINISH_TIMEOUT_S = 600.0
 _IDLE_S = 4.0  # longer than the repair of a lost message takes
+_MAP_SHARE = 0.1  # of the time that drawing the growing map may take
 
 
 class SonarMapper(Node):
@@ -87,6 +89,7 @@ class SonarMapper(Node):
         self._last_problem = ""
         self._odom_stamp_ns = 0
         self._map_stamp_ns = 0
+        self._map_due_s = 0.0
         self._is_finished = False
         self._heard_s = time.monotonic()
         self._worker = Worker("mapper", self._on_worker_error)
@@ -142,13 +145,9 @@ class SonarMapper(Node):
             (FluidPressure, "depth", self._depth_of, self._config.sensor_queue),
         )
         for msg_type, topic, convert, depth in sensors:
-            self.create_subscription(
-                msg_type,
-                topic,
-                functools.partial(self._on_message, topic, convert),
-                sensor_qos(depth, is_reliable=self._config.is_reliable),
-                callback_group=group,
-            )
+            take = functools.partial(self._on_message, topic, convert)
+            qos = sensor_qos(depth, is_reliable=self._config.is_reliable)
+            subscribe_draining(self, msg_type, topic, take, qos, group)
             self._streams.append(topic)
             full_name = self.resolve_topic_name(topic)
             package = msg_type.__module__.split(".")[0]
@@ -244,7 +243,7 @@ class SonarMapper(Node):
         """At the start, wait for the first message of every sensor that somebody sends."""
         for topic in self._streams:
             if self.count_publishers(topic):
-                self._order.advance(topic, stamp_ns - int(self._config.jump_back_s * 1e9))
+                self._order.expect(topic, stamp_ns)
 
     def _restart(self) -> None:
         self._order.clear()
@@ -261,6 +260,9 @@ class SonarMapper(Node):
     def _flush(self) -> None:
         for event in self._order.rest():
             self._feed(event)
+        stamp_ns = self._mapper.stamp_ns
+        if stamp_ns is not None and stamp_ns > self._map_stamp_ns:
+            self._publish_map(stamp_ns)
 
     def _drain(self) -> None:
         """Feed what is due, in the order of the stamps."""
@@ -298,7 +300,8 @@ class SonarMapper(Node):
             self._publish_odometry(stamp_ns)
         if isinstance(event, _PINGS):
             self._mapper_values = self._mapper.diagnostics()
-            if stamp_ns - self._map_stamp_ns >= self._config.map_period_s * 1e9:
+            is_old = stamp_ns - self._map_stamp_ns >= self._config.map_period_s * 1e9
+            if is_old and time.monotonic() >= self._map_due_s:
                 self._publish_map(stamp_ns)
 
     def _finish(self) -> str:
@@ -345,12 +348,17 @@ class SonarMapper(Node):
         stamps_ns, poses = self._mapper.trajectory()
         if not len(poses):
             return
+        begun_s = time.monotonic()
         frame_id = f"{self._vehicle_id}/map"
         occupancy = self._mapper.vehicle_map()
         self._map_pub.publish(occupancy_to_msg(occupancy, frame_id, stamp_ns))
         self._path_pub.publish(
             path_to_msg(stamps_ns, poses, frame_id, stamp_ns, self._config.path_max_poses)
         )
+        # A replay may be faster than time, and a map of hours slow to draw.
+        ended_s = time.monotonic()
+        wait_s = max(self._config.map_period_s, (ended_s - begun_s) / _MAP_SHARE)
+        self._map_due_s = ended_s + wait_s
 
     # --- services and diagnostics ------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.mapping.matcher import (
     match_points,
     thin,
 )
-from uw_dslam_ros2.core.mapping.rivals import conflict, has_rival
+from uw_dslam_ros2.core.mapping.rivals import conflict, rivals, without_direction
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
@@ -87,7 +87,7 @@ def _verified(
     Two judges look within the window that the graph allows: the mapper's matcher at echoes, the
     registration engine at walls and free water. The engine accepts by itself; where it does not,
     but finds the same pose as a matcher that is sure, the two together are enough. Where the same
-    walls would fit a period further, nothing is believed.
+    walls would fit a period further, only what lies across the periods is believed.
     """
     loop, fine = config.loop, config.match.sigma_m
     sigma = np.sqrt(np.diag(prior.covariance)) * loop.search_sigma
@@ -103,8 +103,6 @@ def _verified(
     T_target_source = _agreed(target, source, guess, window, config)
     if T_target_source is None:
         return None
-    if has_rival(target, source, T_target_source, prior, window.half_width_m, fine):
-        return None
     near = Prior(T_target_source, np.diag([fine, fine, _NEAR_RAD]) ** 2)
     match = _matched(target, source, near, (4.0 * fine, 4.0 * fine, 2.0 * _NEAR_RAD), config)
     if match.overlap < loop.min_overlap:
@@ -112,7 +110,9 @@ def _verified(
     rotation = np.eye(3)
     rotation[:2, :2] = match.T_target_source.rotation()
     bend = target.drift + rotation @ source.drift @ rotation.T
-    return match.T_target_source, with_bend(match.information, bend)
+    others = rivals(target, source, match.T_target_source, prior, window.half_width_m, fine)
+    information = without_direction(match.information, others)
+    return match.T_target_source, with_bend(information, bend)
 
 
 def _agreed(
@@ -133,9 +133,9 @@ def _agreed(
     if judged.is_accepted and _is_within(judged.T_target_source, window):
         # The engine's last digits depend on how memory is aligned; the mapper's must not.
         return SE2.from_array(np.round(judged.T_target_source.as_array(), _DIGITS))
-    if judged.verdict is not Verdict.NOT_ENOUGH_OVERLAP or not _is_sure(
-        guess, target, source, config
-    ):
+    # Whether the walls would fit elsewhere too is asked below, where the prior has its say.
+    is_open = judged.verdict in (Verdict.NOT_ENOUGH_OVERLAP, Verdict.AMBIGUOUS)
+    if not is_open or not _is_sure(guess, target, source, config):
         return None
     distance, turn = judged.T_target_source.distance_to(guess.T_target_source)
     is_same = distance <= 3.0 * config.match.sigma_m and turn <= _NEAR_RAD

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior
+from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points
 from uw_dslam_ros2.core.mapping.occupancy import UNITS_PER_NAT, PackedEvidence, SparseEvidence
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["conflict", "has_rival"]
+__all__ = ["conflict", "rivals", "without_direction"]
 
 FloatArray = NDArray[np.float64]
 _SURELY_FREE_NATS = 0.6
@@ -23,6 +23,9 @@ _LEAST_SHARE = 0.5
 # A rival that the prior makes twenty times less likely than the pose itself is none.
 _LOG_ODDS = 3.0
 _SLACK = 0.08
+# How far a submap may turn between one fit and the next along the same walls.
+_YAW_RAD = 0.03
+_ANYWHERE_M2 = 1e8
 
 
 def conflict(
@@ -38,44 +41,78 @@ def conflict(
     return float(_on_water(grid, points, T_grid_points).sum()) / len(points)
 
 
-def has_rival(
+def rivals(
     target: ClosedSection,
     source: ClosedSection,
     T_target_source: SE2,
     prior: Prior,
     half_width_m: float,
     sigma_m: float,
-) -> bool:
-    """Whether another pose near the prior explains the source's echoes about as well.
+) -> FloatArray:
+    """Offsets (K, 2) [m] to other poses near the prior that explain the source's echoes as well.
 
-    Poses with the yaw of ``T_target_source`` are tried, within `half_width_m` of the prior's mean
-    and farther than six `sigma_m` from the pose itself. How well a pose explains what is in both
-    submaps is the number of echoes that meet echoes, over all those where the target has looked.
+    They are sought with the yaw of ``T_target_source``, within `half_width_m` of the prior's mean,
+    then matched as that pose itself was; what comes nearer to it than six `sigma_m` is the same.
+    How well a pose explains what is in both submaps is the number of echoes that meet echoes,
+    over all those where the target has looked.
     """
     stride = max(1, -(-len(source.points) // _MAX_POINTS))
     points = source.points[::stride]
-    field = LikelihoodField(target.points, target.weight, 2.0 * sigma_m)
+    field = LikelihoodField(target.points, target.weight, sigma_m)
     grid = target.evidence.unpacked()
     best_met, best_against = _agreement(field, grid, points, T_target_source)
-    center = prior.T_target_source.as_array()
-    center[2] = T_target_source.yaw
-    step = 2.0 * sigma_m
-    num = int(np.ceil(half_width_m / step))
-    scores = field.window(
-        points, np.ones(len(points)), center, np.array([num, num, 0]), step, 1.0
-    )[0]
+    least_met = _LEAST_SHARE * best_met
+    least_quality = _quality(best_met, best_against) - _SLACK
     limit = _distance(prior, T_target_source) + 2.0 * _LOG_ODDS
-    for offset in _peaks(scores, num, step):
-        pose = SE2(float(center[0] + offset[0]), float(center[1] + offset[1]), float(center[2]))
-        if pose.distance_to(T_target_source)[0] <= 6.0 * sigma_m:
-            continue
-        if _distance(prior, pose) > limit:
+    found = []
+    for pose in _fits(target, points, T_target_source.yaw, prior, half_width_m, sigma_m):
+        is_same = pose.distance_to(T_target_source)[0] <= 6.0 * sigma_m
+        if is_same or _distance(prior, pose) > limit:
             continue
         met, against = _agreement(field, grid, points, pose)
-        is_large = met >= _LEAST_SHARE * best_met
-        if is_large and _quality(met, against) >= _quality(best_met, best_against) - _SLACK:
-            return True
-    return False
+        if met >= least_met and _quality(met, against) >= least_quality:
+            found.append((pose.x - T_target_source.x, pose.y - T_target_source.y))
+    return np.array(found).reshape(-1, 2)
+
+
+def without_direction(information: FloatArray, offsets: FloatArray) -> FloatArray:
+    """Information (3, 3) of a match that fits as well at `offsets` (K, 2) [m] from its pose.
+
+    Nothing is left along the line through them; how far they lie off that line counts as error.
+    """
+    if len(offsets) == 0:
+        return information
+    values, vectors = np.linalg.eigh(offsets.T @ offsets)
+    along, across = vectors[:, 1], vectors[:, 0]
+    spread = np.zeros((3, 3))
+    spread[:2, :2] = _ANYWHERE_M2 * np.outer(along, along)
+    spread[:2, :2] += values[0] / (len(offsets) + 1) * np.outer(across, across)
+    return np.asarray(information @ np.linalg.inv(np.eye(3) + spread @ information))
+
+
+def _fits(
+    target: ClosedSection,
+    points: FloatArray,
+    yaw_rad: float,
+    prior: Prior,
+    half_width_m: float,
+    sigma_m: float,
+) -> list[SE2]:
+    """Poses within the window at which points (N, 2) fit the target best, each matched anew."""
+    step = 2.0 * sigma_m
+    ones = np.ones(len(points))
+    coarse = LikelihoodField(target.points, target.weight, step)
+    fine = LikelihoodField(target.points, target.weight, sigma_m)
+    center = prior.T_target_source.as_array()
+    center[2] = yaw_rad
+    num = int(np.ceil(half_width_m / step))
+    scores = coarse.window(points, ones, center, np.array([num, num, 0]), step, 1.0)[0]
+    reach = (step, step, _YAW_RAD)
+    fits = []
+    for x, y in _peaks(scores, num, step) + center[:2]:
+        near = Prior(SE2(float(x), float(y), yaw_rad), np.diag(reach) ** 2)
+        fits.append(match_points([fine], points, ones, near, reach, 1.0).T_target_source)
+    return fits
 
 
 def _distance(prior: Prior, pose: SE2) -> float:

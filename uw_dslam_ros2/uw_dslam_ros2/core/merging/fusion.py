@@ -300,16 +300,18 @@ class Mosaic:
                 continue
             part = owners[patch.window.slices(window)]
             before, after = part[patch.observed], {}
-            for number in np.unique(before).tolist():
+            for number in np.flatnonzero(np.bincount(before)).tolist():
                 after[number] = len(sets)
                 sets.append(sets[number] | {key})
             table = np.zeros(max(after, default=0) + 1, dtype=np.uint32)
             table[list(after)] = list(after.values())
             part[patch.observed] = table[before]
         # Sets that a later patch has covered wholly are used by no cell any more.
-        used, packed = np.unique(np.append(owners, np.uint32(0)), return_inverse=True)
-        owners = packed[:-1].reshape(window.shape).astype(np.uint32)
-        return owners, [sets[number] for number in used.tolist()]
+        is_used = np.bincount(owners.ravel(), minlength=len(sets)) > 0
+        is_used[0] = True
+        packed = (np.cumsum(is_used) - 1).astype(np.uint32)
+        used = np.flatnonzero(is_used).tolist()
+        return packed[owners], [sets[number] for number in used]
 
     def _add(self, patch: Patch, sign: int) -> None:
         if patch.units.size == 0:

@@ -78,6 +78,37 @@ def predict(state, covariance, dt_s, noise):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _solved(matrix, right):  # type: ignore[no-untyped-def]
+    """Solution (k, n) of a small symmetric positive definite system, by Cholesky's method.
+
+    numba's `np.linalg.solve` does the same and takes ten seconds to compile.
+    """
+    size = len(matrix)
+    lower, found = np.zeros((size, size)), right.copy()
+    for i in range(size):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= lower[i, k] * lower[j, k]
+            if i > j:
+                lower[i, j] = rest / lower[j, j]
+            elif rest > 0.0:
+                lower[i, i] = np.sqrt(rest)
+            else:
+                raise ValueError("a measurement's covariance is not positive definite")
+    for column in range(found.shape[1]):
+        for i in range(size):
+            for k in range(i):
+                found[i, column] -= lower[i, k] * found[k, column]
+            found[i, column] /= lower[i, i]
+        for i in range(size - 1, -1, -1):
+            for k in range(i + 1, size):
+                found[i, column] -= lower[k, i] * found[k, column]
+            found[i, column] /= lower[i, i]
+    return found
+
+
+@njit(cache=True, nogil=True)
 def gated_update(state, covariance, innovation, jac, noise, gate):  # type: ignore[no-untyped-def]
     """Kalman update (Joseph form) unless the squared Mahalanobis distance exceeds `gate`.
 
@@ -88,10 +119,10 @@ def gated_update(state, covariance, innovation, jac, noise, gate):  # type: igno
     """
     cross = covariance @ jac.T
     spread = jac @ cross + noise
-    distance = innovation @ np.linalg.solve(spread, innovation)
+    distance = np.sum(innovation * _solved(spread, innovation.reshape(-1, 1)).ravel())
     if 0.0 <= gate < distance:
         return state, covariance, distance
-    gain = np.linalg.solve(spread, cross.T).T
+    gain = _solved(spread, np.ascontiguousarray(cross.T)).T
     shrink = np.eye(NUM_STATES) - gain @ jac
     updated = shrink @ covariance @ shrink.T + gain @ noise @ gain.T
     return state + gain @ innovation, 0.5 * (updated + updated.T), distance

@@ -84,8 +84,8 @@ class VerdictModels:
 
 
 MODELS = VerdictModels(
-    pose=(-3.8006, 6.5251, -11.391, 0.6733, -6.344, 0.8461, -0.1537),
-    match=(0.0944, 0.8869, -0.7805),
+    pose=(-2.2827, 5.9823, -11.9677, 0.6946, -6.502, 0.6251, -0.1962),
+    match=(0.096, 0.8388, -1.2505),
 )
 """Fitted by `study verdict` with its default settings, which prints them."""
 
