@@ -11,6 +11,7 @@ from uw_dslam_ros2.core.registration.baselines import procrustes
 from uw_dslam_ros2.core.registration.lattice_scan import lattice_maxima
 from uw_dslam_ros2.core.registration.point_evidence import EvidenceModel, Outline
 from uw_dslam_ros2.core.registration.refine import PointModel, polish, refine
+from uw_dslam_ros2.core.registration.refinement import Refinement
 from uw_dslam_ros2.core.registration.repetition import design_effect
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -144,6 +145,23 @@ def test_the_lattice_has_the_planted_pose_and_keeps_to_its_budget():
     ]
     assert min(gaps) > 0.1
     assert len(lattice_maxima(source, target, 0.1, 10.0, 5, 1e5)) == 0
+
+
+def test_every_noise_counts_alike_beforehand():
+    """The evidence of a smaller noise falls as the likelihood integrated over all noises does."""
+    model = PointModel.of(*np.random.default_rng(8).uniform(-1.0, 1.0, (2, 40, 2)), 4.0, 1e-6, 0.5)
+    evidence, num_pairs, all_noises = evidence_model(model), 30.0, np.linspace(1e-4, 0.5, 50_000)
+
+    def log_integral(estimate):
+        ratio = estimate / all_noises
+        log_likelihood = num_pairs * (2.0 * np.log(ratio) + 1.0 - ratio**2)
+        return math.log(np.exp(log_likelihood).mean())
+
+    def value(estimate):
+        found = Refinement(np.zeros(3), estimate, num_pairs, 0.0, np.eye(3))
+        return evidence.of(found)
+
+    assert value(0.1) - value(0.02) == pytest.approx(log_integral(0.1) - log_integral(0.02), 0.01)
 
 
 def test_evidence_prefers_overlap_but_not_within_a_given_window():

@@ -44,7 +44,7 @@ FloatArray = NDArray[np.float64]
 
 # Kernels, in mean spacings of the target points: that of the search with the proof, those of the
 # lattices where it is not decisive, and that of a last search for the few that match exactly.
-_FIRST, _LATTICES, _LAST = 0.75, (0.75, 0.5, 0.25), 0.1
+_FIRST, _LATTICES, _LAST = 0.75, (1.2, 0.75, 0.5, 0.25, 0.1), 0.1
 _LAST_BOXES = 30_000  # the last search only has to offer candidates, not a proof
 _NUM_LATTICE = 100  # candidates of each lattice
 _LATTICE_ADDITIONS = 1.5e9  # points times nodes that a lattice may cost: about a second
@@ -344,15 +344,18 @@ class _Match:
 
     def _distinct(self, found: Iterable[Candidate]) -> list[Candidate]:
         """Best first, each pose once."""
+        ordered = sorted(found, key=lambda pair: -pair[0])
+        poses = np.array([refinement.parameters for _, refinement in ordered])
+        is_near = np.zeros(len(ordered), dtype=np.bool_)
         kept: list[Candidate] = []
-        for pair in sorted(found, key=lambda pair: -pair[0]):
-            if all(self._is_apart(pair[1].pose(), other.pose()) for _, other in kept):
-                kept.append(pair)
+        for k, pair in enumerate(ordered):
+            if is_near[k]:
+                continue
+            kept.append(pair)
+            turn = np.abs(wrap_angle(poses[:, 0] - poses[k, 0]))
+            shift = np.hypot(poses[:, 1] - poses[k, 1], poses[:, 2] - poses[k, 2])
+            is_near |= shift + turn * self._arm_m <= 0.5 * self._spacing_m
         return kept
-
-    def _is_apart(self, a: SE2, b: SE2) -> bool:
-        translation, rotation = a.distance_to(b)
-        return translation + rotation * self._arm_m > 0.5 * self._spacing_m
 
     def _polished(self, candidate: Candidate) -> Candidate:
         refinement = polish(self._model, candidate[1])

@@ -119,8 +119,8 @@ class EvidenceModel:
         most, pairs = min(len(self.source), len(self.target)), refinement.num_pairs
         width = math.sqrt(2.0 * math.pi * max(pairs * (1.0 - pairs / most), 0.2))
         log_pairs = math.log(min(width / (most + 1.0), 1.0))
-        width = math.sqrt(2.0 * math.pi / max(pairs, 1.0))  # of the variance's logarithm
-        share = width * (refinement.sigma_m / self.max_sigma_m) ** 2
+        width = math.sqrt(0.5 * math.pi / max(pairs, 1.0))  # of the noise's logarithm
+        share = width * refinement.sigma_m / self.max_sigma_m
         return log_pairs + math.log(min(share, 1.0))
 
     def log_overlap(self, pose: SE2) -> float:
