@@ -26,15 +26,17 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.ros.conversions import (
     occupancy_from_msg,
     occupancy_to_msg,
-    options_from_msg,
-    options_to_msg,
     path_to_msg,
-    registration_from_msg,
-    registration_to_msg,
     stamp_ns_from_msg,
     stamp_to_msg,
     submap_from_msg,
     submap_to_msg,
+)
+from uw_dslam_ros2.ros.registration_messages import (
+    options_from_msg,
+    options_to_msg,
+    registration_from_msg,
+    registration_to_msg,
 )
 
 pytestmark = pytest.mark.ros

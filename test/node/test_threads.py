@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from uw_dslam_ros2.ros.conversions import refused_registration
 from uw_dslam_ros2.ros.playback import Pacer
 from uw_dslam_ros2.ros.registration_jobs import RegistrationJobs
+from uw_dslam_ros2.ros.registration_messages import refused_registration
 from uw_dslam_ros2.ros.worker import Worker
 
 pytestmark = pytest.mark.ros

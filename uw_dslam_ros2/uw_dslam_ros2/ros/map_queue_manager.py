@@ -31,13 +31,7 @@ from uw_dslam_ros2.core.merging import (
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.session import load_session, save_session
 from uw_dslam_ros2.ros.arrivals import Arrivals
-from uw_dslam_ros2.ros.conversions import (
-    occupancy_to_msg,
-    options_to_msg,
-    refused_registration,
-    registration_from_msg,
-    submap_from_msg,
-)
+from uw_dslam_ros2.ros.conversions import occupancy_to_msg, submap_from_msg
 from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
 from uw_dslam_ros2.ros.map_publisher import MapPublisher
@@ -51,6 +45,11 @@ from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_paramete
 from uw_dslam_ros2.ros.qos import LATCHED, SUBMAPS
 from uw_dslam_ros2.ros.queue_services import QueueServices, has_session
 from uw_dslam_ros2.ros.registration_clients import RegistrationClients
+from uw_dslam_ros2.ros.registration_messages import (
+    options_to_msg,
+    refused_registration,
+    registration_from_msg,
+)
 from uw_dslam_ros2.ros.running import run_node
 from uw_dslam_ros2.ros.worker import Worker
 
