@@ -10,6 +10,7 @@ from uw_dslam_ros2.core.mapping.covariances import composed_covariance
 from uw_dslam_ros2.core.mapping.graph import SubmapGraph
 from uw_dslam_ros2.core.mapping.loops import _verified
 from uw_dslam_ros2.core.mapping.matcher import Prior
+from uw_dslam_ros2.core.mapping.rivals import without_direction
 from uw_dslam_ros2.core.mapping.section import OpenSection
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import SonarConfig, detections_from_scan
@@ -74,10 +75,34 @@ def test_uneven_piers_close_a_loop(rng, along):
 
 @pytest.mark.parametrize("along", [1.0, 5.0])
 @pytest.mark.parametrize("off", [-SPACING, 0.0, SPACING])
-def test_periodic_piers_are_refused_where_the_window_holds_two_fits(rng, along, off):
+def test_of_periodic_piers_only_what_lies_across_is_believed(rng, along, off):
     target, source, T_true = pair(PERIODIC, rng, along)
-    # The right pose is not believed either: nothing but luck would have told it apart.
-    assert close(target, source, SE2(0.0, off, 0.0) @ T_true) is None
+    answer = close(target, source, SE2(0.0, off, 0.0) @ T_true)
+    if answer is None:
+        return
+    T_target_source, information = answer
+    # The quay runs along the target's y axis; where along it nothing but luck would have told.
+    sigma_across, sigma_along = 1.0 / np.sqrt(np.diag(information)[:2] + 1e-12)
+    assert sigma_along > SPACING
+    assert abs(T_target_source.x - T_true.x) < 4.0 * sigma_across + 0.05
+    assert abs(T_target_source.yaw - T_true.yaw) < 0.01
+
+
+def test_nothing_is_left_along_the_rivals_and_nothing_is_lost_across():
+    information = np.diag([400.0, 100.0, 2500.0])
+    along = np.array([0.6, 0.8])
+    offsets = np.array([[2.4, 3.2], [-2.4, -3.2]])
+    left = without_direction(information, offsets)
+    np.testing.assert_allclose(left[:2, :2] @ along, 0.0, atol=1e-5)
+    # Across, what a projection keeps: information given that the place along is free.
+    across = np.array([-0.8, 0.6])
+    expected = 1.0 / (across @ np.linalg.inv(information[:2, :2]) @ across)
+    assert across @ left[:2, :2] @ across == pytest.approx(expected, rel=1e-5)
+    assert left[2, 2] == pytest.approx(2500.0)
+    # Rivals on all sides leave next to nothing.
+    around = np.array([[3.0, 0.0], [0.0, 3.0], [-3.0, 0.0], [0.0, -3.0]])
+    assert np.linalg.eigvalsh(without_direction(information, around)[:2, :2])[-1] < 1.0
+    np.testing.assert_array_equal(without_direction(information, np.empty((0, 2))), information)
 
 
 def graph_of(num_submaps=7):
