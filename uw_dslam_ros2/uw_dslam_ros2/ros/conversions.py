@@ -132,7 +132,7 @@ def covariance_from_pose_msg(msg: PoseWithCovariance, name: str) -> FloatArray:
 
 
 def check_covariance(covariance: FloatArray, name: str) -> None:
-    """Raise `InvalidInputError` unless a covariance (3, 3) is finite, symmetric, not negative."""
+    """Raise `InvalidInputError` unless a covariance (3, 3) is finite with no negative variance."""
     if not np.isfinite(covariance).all():
         raise InvalidInputError(
             f"{name} holds {covariance.ravel().tolist()}, expected finite numbers"

@@ -8,13 +8,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from geometry_msgs.msg import TwistWithCovarianceStamped
-from marine_acoustic_msgs.msg import Dvl, ProjectedSonarImage
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import FluidPressure, Imu, LaserScan, PointCloud2
 from std_srvs.srv import Trigger
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
@@ -26,10 +23,8 @@ from uw_dslam_ros2.io import messages
 from uw_dslam_ros2.io.events import (
     DepthEvent,
     ImageEvent,
-    ImuEvent,
     PointsEvent,
     ScanEvent,
-    VelocityEvent,
 )
 from uw_dslam_ros2.io.feeding import SensorEvent, feed
 from uw_dslam_ros2.ros.conversions import (
@@ -51,6 +46,7 @@ from uw_dslam_ros2.ros.node_settings import SonarMapperConfig
 from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
 from uw_dslam_ros2.ros.running import run_node
+from uw_dslam_ros2.ros.sensor_inputs import sensor_inputs
 from uw_dslam_ros2.ros.stamp_order import StampOrder
 from uw_dslam_ros2.ros.worker import Worker
 
@@ -131,54 +127,16 @@ class SonarMapper(Node):
         self._broadcaster = FrameBroadcaster(self)
 
     def _create_subscriptions(self, group: Any) -> None:
-        ping_type, ping_topic, to_event = {
-            "image": (ProjectedSonarImage, "sonar", self._image_of),
-            "scan": (LaserScan, "scan", self._scan_of),
-            "points": (PointCloud2, "points", self._points_of),
-        }[self._config.input]
-        is_dvl = self._config.velocity == "dvl"
-        velocity_type = Dvl if is_dvl else TwistWithCovarianceStamped
-        sensors: Iterable[tuple[Any, str, Callable[[Any], SensorEvent | None], int]] = (
-            (ping_type, ping_topic, to_event, self._config.ping_queue),
-            (velocity_type, "dvl", self._velocity_of, self._config.sensor_queue),
-            (Imu, "imu", self._imu_of, self._config.sensor_queue),
-            (FluidPressure, "depth", self._depth_of, self._config.sensor_queue),
-        )
-        for msg_type, topic, convert, depth in sensors:
-            take = functools.partial(self._on_message, topic, convert)
-            qos = sensor_qos(depth, is_reliable=self._config.is_reliable)
-            subscribe_draining(self, msg_type, topic, take, qos, group)
-            self._streams.append(topic)
-            full_name = self.resolve_topic_name(topic)
-            package = msg_type.__module__.split(".")[0]
-            self._expected_types[full_name] = f"{package}/msg/{msg_type.__name__}"
+        for sensor in sensor_inputs(self._config, self._vehicle_id):
+            take = functools.partial(self._on_message, sensor.topic, sensor.to_event)
+            qos = sensor_qos(sensor.queue_depth, is_reliable=self._config.is_reliable)
+            subscribe_draining(self, sensor.msg_type, sensor.topic, take, qos, group)
+            self._streams.append(sensor.topic)
+            full_name = self.resolve_topic_name(sensor.topic)
+            package = sensor.msg_type.__module__.split(".")[0]
+            self._expected_types[full_name] = f"{package}/msg/{sensor.msg_type.__name__}"
 
     # --- messages to events ------------------------------------------------------------------
-
-    def _key(self, msg: Any) -> tuple[str, int, str]:
-        return self._vehicle_id, messages.stamp_of(msg), msg.header.frame_id
-
-    def _image_of(self, msg: Any) -> SensorEvent:
-        image = messages.sonar_image_of(msg, self._config.data_order)
-        return ImageEvent(*self._key(msg), image)
-
-    def _scan_of(self, msg: Any) -> SensorEvent:
-        return ScanEvent(*self._key(msg), *messages.scan_of_laser_scan(msg))
-
-    def _points_of(self, msg: Any) -> SensorEvent:
-        return PointsEvent(*self._key(msg), messages.points_of_cloud(msg))
-
-    def _imu_of(self, msg: Any) -> SensorEvent:
-        return ImuEvent(*self._key(msg), *messages.yaw_of_imu(msg))
-
-    def _depth_of(self, msg: Any) -> SensorEvent:
-        depth_m = messages.depth_of_pressure(msg, self._config.water_density_kg_m3)
-        return DepthEvent(*self._key(msg), depth_m)
-
-    def _velocity_of(self, msg: Any) -> SensorEvent | None:
-        is_dvl = self._config.velocity == "dvl"
-        value = messages.velocity_of_dvl(msg) if is_dvl else messages.velocity_of_twist(msg)
-        return None if value is None else VelocityEvent(*self._key(msg), *value)
 
     def _on_message(
         self, topic: str, convert: Callable[[Any], SensorEvent | None], msg: Any
