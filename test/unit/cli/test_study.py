@@ -170,3 +170,9 @@ def test_field_scores_all_methods_on_the_same_pairs(tmp_path, capsys, monkeypatc
             assert all(float(row["mse"]) < float(r["mse"]) for r in wrong)
     assert (tmp_path / "harbour_70.png").exists()
     assert "ORB + RANSAC" in capsys.readouterr().out
+
+
+def test_outliers_refuses_a_cell_that_is_not_there(tmp_path, capsys):
+    arguments = ["--only", "paper", "--cells", "outliers 41%"]
+    assert main(["outliers", "--out", str(tmp_path), *arguments]) == 1
+    assert "outliers 41%" in capsys.readouterr().err
