@@ -268,11 +268,14 @@ def add_ping(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def resample_add(  # type: ignore[no-untyped-def]
-    target, target_observed, target_row, target_col,
+    target, target_count, target_row, target_col,
     source, source_observed, source_row, source_col,
-    x, y, yaw, resolution,
+    x, y, yaw, resolution, sign,
 ):  # fmt: skip
-    """Add a grid at pose (x, y, yaw) to the target: each target cell takes its nearest cell."""
+    """Add a grid at pose (x, y, yaw) to the target: each target cell takes its nearest cell.
+
+    The count is of the grids that observed a cell; a `sign` of -1 takes the grid out again.
+    """
     num_rows, num_cols = target.shape
     source_rows, source_cols = source.shape
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -300,5 +303,5 @@ def resample_add(  # type: ignore[no-untyped-def]
             i = int(np.floor(ly / resolution)) - source_row
             j = int(np.floor(lx / resolution)) - source_col
             if 0 <= i < source_rows and 0 <= j < source_cols and source_observed[i, j]:
-                target[row, col] += source[i, j]
-                target_observed[row, col] = True
+                target[row, col] += sign * source[i, j]
+                target_count[row, col] += sign

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,16 +12,11 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.grid_kernels import (
-    NUM_DIRECTIONS,
-    add_ping,
-    beam_table,
-    resample_add,
-)
+from uw_dslam_ros2.core.mapping.grid_kernels import NUM_DIRECTIONS, add_ping, beam_table
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import Detections
 
-__all__ = ["UNITS_PER_NAT", "GrowingGrid", "PackedEvidence", "SparseEvidence", "fuse"]
+__all__ = ["UNITS_PER_NAT", "GrowingGrid", "PackedEvidence", "SparseEvidence"]
 
 UNITS_PER_NAT = 1000.0
 """Evidence is counted in integers of a thousandth of a nat, so that sums are exact in any
@@ -192,28 +186,3 @@ class GrowingGrid:
             evidence[window], observed[window] = self._evidence, self._observed
         self._row, self._col, self._evidence, self._observed = row, col, evidence, observed
         self._scratch = np.zeros((rows, cols), np.int16)
-
-
-def fuse(parts: Iterable[tuple[SparseEvidence, SE2]], log_odds_max: float) -> OccupancyMap:
-    """One map of several grids at their poses; evidence is summed, order does not matter."""
-    items = list(parts)
-    if not items:
-        raise InvalidInputError("there is no grid to fuse, expected at least one")
-    resolution = items[0][0].resolution_m
-    corners = np.vstack([pose.apply(part.corners()) for part, pose in items])
-    col, row = np.floor(corners.min(axis=0) / resolution).astype(np.int64)
-    cols, rows = np.ceil(corners.max(axis=0) / resolution).astype(np.int64) - (col, row)
-    evidence, observed = np.zeros((rows, cols), np.int32), np.zeros((rows, cols), np.bool_)
-    for part, pose in items:
-        if part.resolution_m != resolution:
-            raise InvalidInputError(
-                f"resolution is {part.resolution_m} m, expected {resolution} m"
-            )
-        resample_add(
-            evidence, observed, int(row), int(col),
-            part.evidence, part.observed, part.row, part.col,
-            pose.x, pose.y, pose.yaw, resolution,
-        )  # fmt: skip
-    return SparseEvidence(evidence, observed, int(row), int(col), resolution).to_occupancy(
-        log_odds_max
-    )

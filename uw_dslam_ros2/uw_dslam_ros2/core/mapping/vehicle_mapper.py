@@ -13,9 +13,9 @@ from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.covariances import composed_covariance
 from uw_dslam_ros2.core.mapping.estimators import make_estimator
+from uw_dslam_ros2.core.mapping.fused_map import FusedMap
 from uw_dslam_ros2.core.mapping.local_map import LocalMap
 from uw_dslam_ros2.core.mapping.matcher import Prior
-from uw_dslam_ros2.core.mapping.occupancy import fuse
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.navigation import NavigationFilter
@@ -50,6 +50,7 @@ class VehicleMapper:
         self._navigation = NavigationFilter(config.navigation)
         self._estimator = make_estimator(config)
         self._local_map = LocalMap(config.match)
+        self._fused = FusedMap(config.occupancy.resolution_m)
         self._closed: list[ClosedSection] = []
         self._open: OpenSection | None = None
         self._pending: list[tuple[int, int, Detections, SE2]] = []
@@ -209,17 +210,23 @@ class VehicleMapper:
         return np.concatenate(stamps), np.vstack(poses)
 
     def vehicle_map(self) -> OccupancyMap:
-        """All submaps, the open one included, in odom.
+        """All submaps, the open one included, in odom: as they were last issued.
 
         Raises `InvalidInputError` before the first ping.
         """
-        parts = [section.evidence.unpacked() for section in self._closed]
-        if self._open is not None:
-            parts.append(self._open.grid.trimmed())
-        if not parts:
+        if not self._closed and self._open is None:
             raise InvalidInputError("there is no map yet, expected a ping with navigation first")
-        poses = self._estimator.poses
-        return fuse(zip(parts, poses, strict=True), self._config.occupancy.log_odds_max)
+        fused = self._fused
+        for index, section in enumerate(self._closed):
+            if fused.pose(index) != section.T_odom_issued:
+                fused.place(index, section.evidence, section.T_odom_issued)
+        if self._open is None:
+            return fused.to_occupancy(self._config.occupancy.log_odds_max)
+        grid, newest = self._open.grid.trimmed(), len(self._closed)
+        fused.place(newest, grid, self._estimator.poses[newest])
+        occupancy = fused.to_occupancy(self._config.occupancy.log_odds_max)
+        fused.remove(newest, grid)
+        return occupancy
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counters and the filter's beliefs, by name."""
