@@ -38,7 +38,7 @@ class GridRegistrationConfig(Config):
         0.9, 0.1, 1.0, "a rival's score from which on it is ambiguous"
     )
     max_rival_probability: float = setting(
-        0.7, 0.0, 1.0, "a rival that by itself is more probable than that makes it ambiguous"
+        0.8, 0.0, 1.0, "a rival that by itself is more probable than that makes it ambiguous"
     )
     max_slide_share: float = setting(
         0.85, 0.1, 1.0, "score ten cells off in the weakest direction; a straight wall keeps it"

@@ -85,7 +85,7 @@ class VerdictModels:
 
 MODELS = VerdictModels(
     pose=(-2.2827, 5.9823, -11.9677, 0.6946, -6.502, 0.6251, -0.1962),
-    match=(0.096, 0.8388, -1.2505),
+    match=(0.0506, 0.8459, -0.6334),
 )
 """Fitted by `study verdict` with its default settings, which prints them."""
 
