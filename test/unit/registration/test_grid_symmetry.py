@@ -7,7 +7,7 @@ import pytest
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.grids import register_grids
-from uw_dslam_ros2.core.registration.result import Verdict
+from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 
 _ROWS, _COLS = 160, 280
@@ -52,6 +52,15 @@ def test_a_symmetry_that_one_map_shows_is_held_against_a_match(seed, is_target):
     poses = [result.T_target_source, *(rival.T_target_source for rival in result.rivals)]
     for T_true in (SE2(), T_half_turn):
         assert any(_is_near(pose, T_true) for pose in poses)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_prior_that_excludes_the_half_turn_settles_it(seed):
+    place = _place(np.random.default_rng(seed), is_symmetric=True)
+    wide, narrow = _window(place, 0, 200), _window(place, 0, 110)
+    result = register_grids(narrow, wide, prior=PriorWindow(SE2(0.2, -0.1, 0.05), 3.0, 0.3))
+    assert result.verdict is Verdict.ACCEPTED, result.reason
+    assert _is_near(result.T_target_source, SE2())
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -13,7 +13,7 @@ from uw_dslam_ros2.core.features.grid_filter import CellEvidence
 from uw_dslam_ros2.core.features.walls import wall_points
 from uw_dslam_ros2.core.registration import grid_kernels
 from uw_dslam_ros2.core.registration.signed_field import PAD, SignedField, signed_field
-from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 __all__ = ["GridProblem", "PoseWindow", "build_problem"]
 
@@ -27,6 +27,12 @@ class PoseWindow:
 
     middle: FloatArray
     half: FloatArray
+
+    def holds(self, pose: FloatArray) -> bool:
+        """Whether a pose (3,) lies within."""
+        offset = pose - self.middle
+        offset[0] = wrap_angle(float(offset[0]))
+        return bool(np.all(np.abs(offset) <= self.half))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

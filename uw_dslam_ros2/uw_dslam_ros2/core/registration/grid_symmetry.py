@@ -36,10 +36,16 @@ class _Likeness:
     evidence: PoseEvidence
 
 
-def add_twins(found: Found, sides: tuple[WallMap, WallMap], levels: list[GridProblem]) -> Found:
+def add_twins(
+    found: Found,
+    sides: tuple[WallMap, WallMap],
+    levels: list[GridProblem],
+    window: PoseWindow,
+) -> Found:
     """Evidence with the rivals that likenesses within either map make.
 
-    ``sides`` and ``levels`` as for `grid_evidence.weigh`. Where a map is laid on itself by S, a
+    ``sides``, ``levels`` and ``window``, beyond which nothing is a rival, as for
+    `grid_evidence.weigh`. Where a map is laid on itself by S, a
     match T has the rival T S (or S T, on the target's side). Unless the two maps refute it, that
     rival is as convincing as the likeness, and at most as the match.
     """
@@ -59,6 +65,8 @@ def add_twins(found: Found, sides: tuple[WallMap, WallMap], levels: list[GridPro
 
     refined, rivals = list(found.refined), list(evidence.rivals)
     for T_twin, likeness in twins:
+        if not window.holds(levels[0].to_pose(T_twin)):
+            continue
         candidate = _settled(finest, T_twin)
         same = [k for k, c in enumerate(refined) if is_same_pose(finest, c.pose, candidate.pose)]
         if same and same[0] == 0:

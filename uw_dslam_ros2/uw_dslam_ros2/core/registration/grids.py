@@ -168,7 +168,7 @@ class _GridMatch:
             # Where the proof is open, the poses that it could not exclude are rivals like others.
             candidates = merge_best(levels[0], candidates, outcome)
             found = weigh(walls, levels, window, candidates, chance)
-        return self._answer(levels, outcome, _with_twins(found, walls, levels))
+        return self._answer(levels, outcome, _with_twins(found, walls, levels, window))
 
     def collect(self) -> tuple[MatchEvidence, SE2] | None:
         """Evidence for the best pose, and the pose; None where a map holds too little."""
@@ -178,7 +178,7 @@ class _GridMatch:
         levels, walls = prepared
         window = self._window(levels[0])
         found = weigh(walls, levels, window, *scan_candidates(levels[0], window))
-        found = _with_twins(found, walls, levels)
+        found = _with_twins(found, walls, levels, window)
         return found.evidence, self._to_frame(levels[-1].to_motion(found.refined[0].pose))
 
     def _prepare(self) -> tuple[list[GridProblem], tuple[WallMap, WallMap]] | str:
@@ -385,11 +385,13 @@ class _GridMatch:
         )
 
 
-def _with_twins(found: Found, walls: tuple[WallMap, WallMap], levels: list[GridProblem]) -> Found:
+def _with_twins(
+    found: Found, walls: tuple[WallMap, WallMap], levels: list[GridProblem], window: PoseWindow
+) -> Found:
     """Symmetries only matter to a match that would be convincing without them."""
     if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_TWINS:
         return found
-    return add_twins(found, walls, levels)
+    return add_twins(found, walls, levels, window)
 
 
 def _too_little(
