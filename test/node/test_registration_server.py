@@ -22,6 +22,7 @@ from uw_dslam_msgs.srv import RegisterMaps, RegisterPointSets
 
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.registration import register_grids
 from uw_dslam_ros2.core.registration.result import Progress
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.ros import registration_server
@@ -114,6 +115,29 @@ def test_same_room_seen_from_elsewhere_is_found(serve):
     assert distance_m < 0.1
     assert angle_rad < 0.01
     assert response.registration.seconds > 0.0
+
+
+def test_searches_side_by_side_find_what_each_finds_alone(serve):
+    """They share kernels and threads, and nothing else."""
+    target = room_map()
+    sources = [room_map(T_frame_grid=SE2(k, -2.0 * k, 0.3 * k)) for k in range(4)]
+    alone = [register_grids(source, target) for source in sources]
+    with serve(max_parallel=2, max_waiting=2) as (until, probe):
+        client = connected(until, probe, RegisterMaps, "register_maps")
+        futures = [
+            client.call_async(RegisterMaps.Request(source=map_msg(s), target=map_msg(target)))
+            for s in sources
+        ]
+        until(lambda: all(future.done() for future in futures), "all answers")
+    for future, expected in zip(futures, alone, strict=True):
+        found = future.result().registration
+        assert found.verdict == expected.verdict
+        assert found.num_boxes == expected.num_boxes
+        assert found.lower_bound == expected.lower_bound
+        T_found = SE2(found.t_target_source.x, found.t_target_source.y, found.t_target_source.yaw)
+        distance_m, angle_rad = T_found.distance_to(expected.T_target_source)
+        assert distance_m < 1e-3  # a message's origin has another precision than a map's
+        assert angle_rad < 1e-4
 
 
 def test_point_sets_are_aligned(serve, rng):

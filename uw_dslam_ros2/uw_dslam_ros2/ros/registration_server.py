@@ -45,8 +45,8 @@ from uw_dslam_ros2.ros.running import run_node
 __all__ = ["RegistrationServer", "RegistrationServerConfig", "main"]
 
 _FEEDBACK_PERIOD_S = 0.25
-_POLL_S = 0.02
-_CANCEL_PATIENCE_S = 0.05
+_POLL_S = 0.01
+_CANCEL_PATIENCE_S = 0.02
 _NUM_LATENCIES = 200
 
 
