@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.registration import (
     Verdict,
     register_point_sets,
 )
+from uw_dslam_ros2.core.registration.point_verdict import PoseHypothesis, decide_points
 from uw_dslam_ros2.core.se2 import SE2
 
 PLANTED = SE2(0.4, -0.7, 2.2)
@@ -194,13 +195,36 @@ def walls(rng, segments, noise=0.01, step=0.1):
     return together + rng.normal(0.0, noise, together.shape)
 
 
-def test_a_corridor_without_features_is_not_accepted():
-    rng = np.random.default_rng(13)
-    corridor = [(-5.0, -1.0, 5.0, -1.0), (-5.0, 1.0, 5.0, 1.0)]
-    for _ in range(3):
-        seen = walls(rng, corridor), PLANTED.apply(walls(rng, corridor))
-        result = register_point_sets(*seen)
-        assert not result.is_accepted, result.reason
+CORRIDOR = [(-5.0, -1.0, 5.0, -1.0), (-5.0, 1.0, 5.0, 1.0)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("segments", [CORRIDOR, CORRIDOR[:1]], ids=["corridor", "line"])
+def test_walls_along_which_one_can_slide_are_ambiguous(segments, seed):
+    rng = np.random.default_rng([13, seed])
+    result = register_point_sets(walls(rng, segments), PLANTED.apply(walls(rng, segments)))
+    assert result.verdict is Verdict.AMBIGUOUS, result.reason
+    assert result.probability <= 0.5
+    assert result.rivals[0].score > 0.9
+
+
+def test_a_convincing_rival_counts_as_much_as_the_points_prefer_it():
+    def verdict(log_odds, rival_evidence):
+        poses = [
+            PoseHypothesis(evidence, 1e-6 * np.eye(3), evidence, 0.9, odds)
+            for evidence, odds in ((80.0, -math.inf), (rival_evidence, log_odds))
+        ]
+        return decide_points(
+            poses, is_complete=True, gap=0.01, spacing_m=0.1, arm_m=1.0, is_line=False,
+            min_probability=0.95,
+        )  # fmt: skip
+
+    # By the points' scatter either could have won, however many nats lie between them.
+    assert verdict(math.log(0.5), 70.0)[0] is Verdict.AMBIGUOUS
+    assert verdict(-10.0, 70.0)[0] is Verdict.ACCEPTED
+    # A rival that is no better than chance is not asked.
+    assert verdict(math.log(0.5), -6.0)[0] is Verdict.ACCEPTED
+    assert verdict(-math.inf, 79.9)[0] is Verdict.AMBIGUOUS
 
 
 def test_a_room_with_a_corner_of_its_own_is_accepted():

@@ -10,6 +10,7 @@ from uw_dslam_ros2.core.registration import refine_kernels
 from uw_dslam_ros2.core.registration.baselines import procrustes
 from uw_dslam_ros2.core.registration.lattice_scan import lattice_maxima
 from uw_dslam_ros2.core.registration.point_evidence import EvidenceModel, Outline
+from uw_dslam_ros2.core.registration.point_rivals import log_contributions, log_odds
 from uw_dslam_ros2.core.registration.refine import PointModel, polish, refine
 from uw_dslam_ros2.core.registration.refinement import Refinement
 from uw_dslam_ros2.core.registration.repetition import design_effect
@@ -145,6 +146,31 @@ def test_the_lattice_has_the_planted_pose_and_keeps_to_its_budget():
     ]
     assert min(gaps) > 0.1
     assert len(lattice_maxima(source, target, 0.1, 10.0, 5, 1e5)) == 0
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.2, 0.4])
+def test_odds_of_a_rival_are_those_of_points_drawn_again(mean):
+    rng = np.random.default_rng(9)
+    best, rival = rng.normal(mean, 1.0, 80), rng.normal(0.0, 1.0, 80)
+    drawn = rng.integers(0, 80, (20_000, 80))
+    share = float(((best - rival)[drawn].sum(axis=1) < 0.0).mean())
+    odds = math.exp(log_odds(best, rival, 1.0))
+    assert odds / (1.0 + odds) == pytest.approx(min(share, 0.5), abs=0.02)
+    assert log_odds(best, rival, 4.0) >= log_odds(best, rival, 1.0)
+
+
+def test_contributions_of_points_far_apart_sum_to_the_likelihood_of_their_pairs():
+    rng = np.random.default_rng(10)
+    target = rng.permutation(np.stack(np.meshgrid(range(6), range(6)), -1).reshape(-1, 2) * 1.0)
+    source = target[:20] + rng.normal(0.0, 0.02, (20, 2))
+    model = PointModel.of(source, target, 36.0, 1e-6, 0.5)
+    _, found = refine(model, evidence_model(model), np.zeros(3), 0.05)
+    contributions = log_contributions(source, target, found, 36.0)
+    # The one-to-one likelihood divides by the number of ways to choose that many pairs.
+    assert (contributions > 3.0).all()
+    assert contributions.sum() > found.log_likelihood > 0.3 * contributions.sum()
+    away = log_contributions(source + 0.5, target, found, 36.0)
+    assert np.abs(away).max() < 1e-6
 
 
 def test_every_noise_counts_alike_beforehand():

@@ -170,9 +170,7 @@ class _Match:
         candidates[0] = self._polished(candidates[0])
         return packed(
             self._pair, rungs[0], candidates, self._config,
-            spacing_m=self._spacing_m,
-            arm_m=self._arm_m,
-            repetition=self._evidence.repetition,
+            evidence=self._evidence,
             num_boxes=sum(rung.outcome.num_boxes for rung in rungs),
             seconds=self._clock() - start if self._clock else math.nan,
         )  # fmt: skip

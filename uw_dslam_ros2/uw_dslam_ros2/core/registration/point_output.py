@@ -17,7 +17,9 @@ from uw_dslam_ros2.core.registration.branch_and_bound import (
     Term,
 )
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
+from uw_dslam_ros2.core.registration.point_evidence import EvidenceModel
 from uw_dslam_ros2.core.registration.point_input import Cloud, Pair
+from uw_dslam_ros2.core.registration.point_rivals import log_contributions, log_odds
 from uw_dslam_ros2.core.registration.point_verdict import PoseHypothesis, decide_points
 from uw_dslam_ros2.core.registration.refinement import Refinement
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Rival, Verdict
@@ -26,6 +28,8 @@ from uw_dslam_ros2.core.se2 import SE2
 __all__ = ["Candidate", "Rung", "packed", "too_few"]
 
 FloatArray = NDArray[np.float64]
+
+_MAX_COMPARED = 20  # poses that are compared with the best one, point by point
 
 Candidate = tuple[float, Refinement]  # evidence, and what it is for
 
@@ -48,9 +52,7 @@ def packed(
     candidates: Sequence[Candidate],
     config: RegistrationConfig,
     *,
-    spacing_m: float,
-    arm_m: float,
-    repetition: float,
+    evidence: EvidenceModel,
     num_boxes: int,
     seconds: float,
 ) -> RegistrationResult:
@@ -60,18 +62,19 @@ def packed(
     lower = (outcome.lower_bound - rung.error) / rung.unit
     upper = (outcome.upper_bound + rung.error) / rung.unit
     gap = max(0.0, 1.0 - lower / upper) if upper > 0.0 else 0.0
-    covariance = repetition * best.covariance()
+    covariance = evidence.repetition * best.covariance()
     verdict, reason, probability = decide_points(
-        [PoseHypothesis(evidence, repetition * r.covariance()) for evidence, r in candidates],
+        _hypotheses(candidates, evidence),
         is_complete=outcome.status is Status.CERTIFIED,
         gap=gap,
-        spacing_m=spacing_m,
-        arm_m=arm_m,
+        spacing_m=evidence.spacing_m,
+        arm_m=evidence.arm_m,
+        is_line=_is_line(evidence.source) and _is_line(evidence.target),
         min_probability=config.min_probability,
     )
     pose = pair.full_pose(best.pose())
     source_points, target_points = pair.caller_points()
-    is_inlier = _has_partner(pose.apply(source_points), target_points, best, spacing_m)
+    is_inlier = _has_partner(pose.apply(source_points), target_points, best, evidence.spacing_m)
     return RegistrationResult(
         verdict=verdict,
         reason=reason,
@@ -94,6 +97,35 @@ def packed(
         target_points=target_points,
         is_inlier=is_inlier,
     )
+
+
+def _hypotheses(candidates: Sequence[Candidate], evidence: EvidenceModel) -> list[PoseHypothesis]:
+    """What the verdict asks of the poses, the best first."""
+    area_m2 = evidence.target_outline.area_m2
+    most = min(len(evidence.source), len(evidence.target))
+    found: list[PoseHypothesis] = []
+    first = log_contributions(evidence.source, evidence.target, candidates[0][1], area_m2)
+    for k, (own, refinement) in enumerate(candidates):
+        odds = -math.inf
+        if 0 < k < _MAX_COMPARED:
+            other = log_contributions(evidence.source, evidence.target, refinement, area_m2)
+            odds = log_odds(first, other, evidence.repetition)
+        found.append(
+            PoseHypothesis(
+                evidence=own,
+                covariance=evidence.repetition * refinement.covariance(),
+                independent_evidence=evidence.of(refinement, 1.0),
+                pair_share=refinement.num_pairs / most,
+                log_odds=odds,
+            )
+        )
+    return found
+
+
+def _is_line(points: FloatArray) -> bool:
+    """Whether the points spread less across than they lie apart along."""
+    across, along = np.linalg.eigvalsh(np.cov(points.T))
+    return bool(across * len(points) ** 2 < along)
 
 
 def _values(rung: Rung, poses: Sequence[SE2]) -> list[float]:
