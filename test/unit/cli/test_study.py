@@ -101,18 +101,18 @@ def test_nnde_registers_scans_of_the_recording(tmp_path, capsys):
     assert "second registration" in capsys.readouterr().out
 
 
-def test_sigma_compares_fixed_kernels_with_the_ladder(tmp_path, capsys, monkeypatch):
+def test_sigma_compares_fixed_kernels_with_the_engine(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sigma, "_CELLS", (Cell(15, 0.3), Cell(15, 0.0, 0.02)))
-    monkeypatch.setattr(sigma, "_FACTORS", (0.3, 1.0))
+    monkeypatch.setattr(sigma, "_MULTIPLES", (0.3, 1.0))
     assert main(["sigma", "--out", str(tmp_path), "--trials", "2"]) == 0
     with (tmp_path / "sigma.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * (2 + 1 + 1)  # fixed kernels, the paper's, the ladder
+    assert len(rows) == 2 * (2 + 1 + 1)  # fixed kernels, the paper's, the engine
     assert [row["is_paper"] for row in rows].count("1") == 2
     for row in rows:
         if row["is_paper"] == "1":
             assert float(row["sigma_m"]) == pytest.approx(0.1)
-    assert "ladder" in capsys.readouterr().out
+    assert "engine as it is" in capsys.readouterr().out
 
 
 def _rows(path):

@@ -1,10 +1,11 @@
-"""The kernel's width: fixed values against the one that is derived from the data.
+"""The kernel's width: multiples of the one that is derived from the data, and the paper's.
 
-Kernels are the standard deviation of a *pair* of points, in units of the target's spacing (the
-root of its area over its number of points). Drawn are, over fixed kernels: how often the optimum
-of the paper's plain sum lies in the success region, how often the engine does with that kernel
-alone, how far the optimum next to the truth is off, and beside them the engine with its own ladder
-of kernels.
+Kernels are the standard deviation of a *pair* of points. Derived is that of the engine's first
+search, 0.75 of the target's spacing (the root of its area over its number of points). Over fixed
+multiples of it: how often the optimum of the paper's plain sum lies in the success region, how
+often the engine does with that kernel alone and how many boxes it takes, how far the optimum next
+to the truth is off; and beside them the engine as it is, which derives the kernel and goes on with
+others where that one is not decisive.
 """
 
 from __future__ import annotations
@@ -36,20 +37,21 @@ from uw_dslam_ros2.core.se2 import SE2
 __all__ = ["add_arguments", "run"]
 
 _PAPER_SIGMA_M = 0.1
-_FACTORS = (0.1, 0.2, 0.4, 0.75, 1.5, 3.0)
-_MAX_BOXES = 300_000  # hopeless kernels would search for minutes
+_DERIVED = 0.75  # spacings
+_MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
+_MAX_BOXES = 50_000  # hopeless kernels would search for minutes
 _CELLS = (
-    Cell(100, 0.5, 0.0),
-    Cell(100, 0.8, 0.0),
-    Cell(100, 0.5, 0.05),
-    Cell(50, 0.9, 0.02),
-    Cell(100, 0.0, 0.02, 0.3),
+    Cell(50, 0.5, 0.0),
+    Cell(50, 0.8, 0.0),
+    Cell(50, 0.5, 0.05),
+    Cell(50, 0.8, 0.05),
+    Cell(50, 0.0, 0.02, 0.3),
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--trials", type=int, default=10, help="per cell (default: %(default)s)")
+    parser.add_argument("--trials", type=int, default=40, help="per cell (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=2000, help="of the first trial")
 
 
@@ -64,36 +66,37 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _cell(cell: Cell, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """One row for each kernel, and one for the derived ladder (factor empty)."""
-    spacing_m = 2.0 / math.sqrt(len(cell.problem(0).target))  # the square's area is 4
+    """One row for each kernel, and one for the engine as it is (multiple empty)."""
+    derived_m = _DERIVED * 2.0 / math.sqrt(len(cell.problem(0).target))  # the square's area is 4
     problems = [cell.problem(seed) for seed in seeds]
     rows = []
-    paper_factor = math.sqrt(2.0) * _PAPER_SIGMA_M / spacing_m
-    factors = sorted([*_FACTORS, paper_factor])
-    for factor in progress([*factors, None], text=str(cell)):
-        sigma_m = 0.0 if factor is None else factor * spacing_m / math.sqrt(2.0)
+    paper = math.sqrt(2.0) * _PAPER_SIGMA_M / derived_m
+    for multiple in progress([*sorted([*_MULTIPLES, paper]), None], text=str(cell)):
+        sigma_m = 0.0 if multiple is None else multiple * derived_m / math.sqrt(2.0)
         config = RegistrationConfig(sigma=sigma_m, max_boxes=_MAX_BOXES)
-        plain, near, chain = [], [], []
+        plain, near, chain, boxes = [], [], [], []
         for problem in problems:
             source, target, T_true = problem.source, problem.target, problem.T_target_source
             result = register_point_sets(source, target, config)
             chain.append((result.T_target_source, T_true))
-            if factor is not None:
+            boxes.append(result.num_boxes)
+            if multiple is not None:
                 plain.append((search_mixture(source, target, sigma_m), T_true))
                 window = PriorWindow(T_true, 0.15, 0.15)
                 near.append((search_mixture(source, target, sigma_m, window), T_true))
         rows.append(
             {
                 "cell": str(cell),
-                "factor": "" if factor is None else factor,
-                "sigma_m": "" if factor is None else sigma_m,
-                "is_paper": int(factor == paper_factor),
-                "spacing_m": spacing_m,
+                "multiple": "" if multiple is None else multiple,
+                "sigma_m": "" if multiple is None else sigma_m,
+                "is_paper": int(multiple == paper),
+                "derived_m": derived_m,
                 "trials": len(problems),
                 "plain_success": _success(plain),
                 "near_deg": _median_deg(near),
                 "engine_success": _success(chain),
                 "engine_deg": _median_deg(chain),
+                "boxes": float(np.median(boxes)),
             }
         )
     return rows
@@ -113,28 +116,28 @@ def _draw(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
     made, axes = figure(2, len(_CELLS), width=3.0 * len(_CELLS), height=5.6)
     for column, cell in enumerate(_CELLS):
         own = [row for row in rows if row["cell"] == str(cell)]
-        fixed, ladder = [row for row in own if row["factor"] != ""], own[-1]
-        factors = [row["factor"] for row in fixed]
+        fixed, ladder = [row for row in own if row["multiple"] != ""], own[-1]
+        multiples = [row["multiple"] for row in fixed]
         top, bottom = axes[0, column], axes[1, column]
         for key, label, colour in (
             ("plain_success", "plain sum, fixed kernel", COLOURS[1]),
             ("engine_success", "engine, fixed kernel", COLOURS[5]),
         ):
             values = [row[key] for row in fixed]
-            top.semilogx(factors, values, "o-", markersize=3, color=colour, label=label)
+            top.semilogx(multiples, values, "o-", markersize=3, color=colour, label=label)
         top.axhline(ladder["engine_success"], color=COLOURS[0], linewidth=2.5, label="engine")
         for key, label, colour in (
             ("near_deg", "optimum next to the truth", COLOURS[1]),
             ("engine_deg", "engine, fixed kernel", COLOURS[5]),
         ):
             floored = np.maximum([row[key] for row in fixed], 1e-3)
-            bottom.loglog(factors, floored, "o-", markersize=3, color=colour, label=label)
+            bottom.loglog(multiples, floored, "o-", markersize=3, color=colour, label=label)
         bottom.axhline(max(ladder["engine_deg"], 1e-3), color=COLOURS[0], linewidth=2.5)
-        paper = next(row["factor"] for row in fixed if row["is_paper"])
+        paper = next(row["multiple"] for row in fixed if row["is_paper"])
         for axis in (top, bottom):
             axis.axvline(paper, color="black", linestyle=":", label="the paper's 0.1")
         top.set(title=str(cell).replace(", ", "\n", 1), ylim=(-0.03, 1.03))
-        bottom.set(xlabel="kernel of a pair / spacing", ylim=(8e-4, 200.0))
+        bottom.set(xlabel="kernel / derived kernel", ylim=(8e-4, 200.0))
     axes[0, 0].set_ylabel("share of successes")
     axes[1, 0].set_ylabel("median rotation error [deg]")
     handles = dict(zip(*reversed(axes[0, 0].get_legend_handles_labels()), strict=True))
@@ -146,10 +149,10 @@ def _draw(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
 def _report(rows: list[dict[str, Any]]) -> None:
     table = []
     for row in rows:
-        kernel = f"{row['factor']:.2f}" if row["factor"] != "" else "ladder"
+        is_ladder = row["multiple"] == ""
+        kernel = "engine as it is" if is_ladder else f"{row['multiple']:.3g}"
         if row["is_paper"]:
             kernel += " (paper)"
-        is_ladder = row["factor"] == ""
         table.append(
             (
                 row["cell"],
@@ -158,9 +161,11 @@ def _report(rows: list[dict[str, Any]]) -> None:
                 "" if is_ladder else f"{row['near_deg']:.3f}",
                 f"{row['engine_success']:.0%}",
                 f"{row['engine_deg']:.4f}",
+                f"{row['boxes']:.0f}",
             )
         )
+    shares = ("plain sum", "near optimum deg")
     print_table(
-        ("cell", "kernel / spacing", "plain sum", "near optimum deg", "engine", "engine deg"),
+        ("cell", "kernel / derived", *shares, "engine", "engine deg", "boxes"),
         table,
     )
