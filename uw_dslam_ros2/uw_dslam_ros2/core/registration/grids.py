@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
-from uw_dslam_ros2.core.features.grid_filter import CellEvidence, clean_cells, coarsen
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grid_candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grid_evidence import Found, weigh
-from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow, build_problem
+from uw_dslam_ros2.core.registration.grid_preparation import FINE_SIGMA_CELLS, prepare_maps
+from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grid_search import (
     SearchLimits,
     SearchOutcome,
@@ -40,9 +40,6 @@ __all__ = ["GridRegistrationConfig", "match_evidence", "register_grids"]
 FloatArray = NDArray[np.float64]
 Clock = Callable[[], float]
 
-_FINE_POINTS = 1200
-_FINE_SIGMA_CELLS = 2.0
-_LEAST_SIDE_CELLS = 4
 _NUM_BOXES_OF_REFUSED = 20_000
 _RIVAL_SHARE = 0.5
 _LOOK_FOR_TWINS = 0.5
@@ -148,7 +145,7 @@ class _GridMatch:
                     f"the {name} map has {rows} x {cols} cells, more than the limit of "
                     f"{self._config.max_side_cells} on a side",
                 )
-        prepared = self._prepare()
+        prepared = prepare_maps(self._source, self._target, self._config)
         if isinstance(prepared, str):
             return self._refused(Verdict.TOO_FEW_FEATURES, prepared)
         levels, walls = prepared
@@ -172,7 +169,7 @@ class _GridMatch:
 
     def collect(self) -> tuple[MatchEvidence, SE2] | None:
         """Evidence for the best pose, and the pose; None where a map holds too little."""
-        prepared = self._prepare()
+        prepared = prepare_maps(self._source, self._target, self._config)
         if isinstance(prepared, str):
             return None
         levels, walls = prepared
@@ -180,48 +177,6 @@ class _GridMatch:
         found = weigh(walls, levels, window, *scan_candidates(levels[0], window))
         found = _with_twins(found, walls, levels, window)
         return found.evidence, self._to_frame(levels[-1].to_motion(found.refined[0].pose))
-
-    def _prepare(self) -> tuple[list[GridProblem], tuple[WallMap, WallMap]] | str:
-        """Problems from coarse to fine, and both maps; or what a map lacks, as a sentence."""
-        resolution_m = self._finest_resolution()
-        sides = []
-        for name, occupancy in (("source", self._source), ("target", self._target)):
-            cells = clean_cells(occupancy)
-            if (fault := _too_little(name, occupancy, cells, self._config)) is not None:
-                return fault
-            sides.append(coarsen(cells, resolution_m))
-        walls = (WallMap(sides[0]), WallMap(sides[1]))
-        return self._levels(*walls), walls
-
-    def _finest_resolution(self) -> float:
-        specs = (self._source.spec, self._target.spec)
-        longest_m = max(max(spec.shape) * spec.resolution_m for spec in specs)
-        coarser = max(spec.resolution_m for spec in specs)
-        # A whole multiple, whose sums are quick.
-        return coarser * math.ceil(longest_m / coarser / self._config.finest_cells - 1e-9)
-
-    def _levels(self, source: WallMap, target: WallMap) -> list[GridProblem]:
-        """Problems from the searched lattice to the finest one."""
-        longest = max(*source.cells.shape, *target.cells.shape)
-        stride = max(1, math.ceil(longest / self._config.working_cells))
-        strides = [stride]
-        while strides[-1] > 1:
-            strides.append(max(1, strides[-1] // 2))
-        levels = []
-        for stride in strides:
-            is_search = stride == strides[0]
-            levels.append(
-                build_problem(
-                    source.cells,
-                    target.cells,
-                    stride=stride,
-                    sigma_cells=self._config.sigma_cells if stride > 1 else _FINE_SIGMA_CELLS,
-                    free_penalty=self._config.free_penalty,
-                    max_points=self._config.max_points if is_search else _FINE_POINTS,
-                    distances=(source.distance, target.distance),
-                )
-            )
-        return levels
 
     def _window(self, problem: GridProblem) -> PoseWindow:
         """Poses that a prior allows, or all."""
@@ -340,7 +295,7 @@ class _GridMatch:
         residual_cells = max(agreement.residual_cells, _LEAST_RESIDUAL_CELLS)
         num_pairs = math.sqrt(max(agreement.num_walls, 1)) / (1.16 * residual_cells**4.5)
         covariance = pose_covariance(
-            problem, pose, num_pairs, _FINE_SIGMA_CELLS, evidence.slide_share
+            problem, pose, num_pairs, FINE_SIGMA_CELLS, evidence.slide_share
         )
         rotation = self._target.spec.T_frame_grid.rotation()
         center = self._points(problem.center[None, :], problem.resolution_m, self._source)[0]
@@ -392,24 +347,3 @@ def _with_twins(
     if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_TWINS:
         return found
     return add_twins(found, walls, levels, window)
-
-
-def _too_little(
-    name: str, occupancy: OccupancyMap, cells: CellEvidence, config: GridRegistrationConfig
-) -> str | None:
-    """What a map lacks for matching, as a sentence, or None."""
-    rows, cols = occupancy.spec.shape
-    if min(rows, cols) < _LEAST_SIDE_CELLS:
-        return f"the {name} map has {rows} x {cols} cells, expected at least {_LEAST_SIDE_CELLS}"
-    if not occupancy.known.any():
-        return f"the {name} map is unknown everywhere"
-    num_walls = int((cells.wall > 0.25).sum())
-    share = float((occupancy.values >= 60).mean())
-    if share > 0.6:
-        return f"the {name} map is occupied in {share:.0%} of its cells, so it shows no surface"
-    if num_walls < config.min_wall_cells:
-        return (
-            f"the {name} map has {num_walls} wall cells after filtering, "
-            f"expected at least {config.min_wall_cells}"
-        )
-    return None
