@@ -65,7 +65,7 @@ def bound_box(problem, box, floor=-math.inf):
     )  # fmt: skip
     kernels.bound_second(
         problem.points, problem.rows, problem.frames, problem.half_of, problem.coefficients,
-        problem.curvatures, box, out, cells,
+        problem.curvatures, box, out, cells, np.empty((14, problem.points.shape[1])),
     )  # fmt: skip
     return first, out[0], out[1]
 

@@ -302,7 +302,7 @@ def bounds_of(problem, box, floor):
     )  # fmt: skip
     kernels.bound_second(
         problem.points, problem.rows, problem.frames, problem.half_of, problem.coefficients,
-        problem.curvatures, box, out, cells,
+        problem.curvatures, box, out, cells, np.empty((14, problem.points.shape[1])),
     )  # fmt: skip
     return first, early, out[0]
 

@@ -30,6 +30,9 @@ value, summed gradient and bounded curvature at the centre (Consolini et al., ar
 which alone closes the gap. Local ascent from promising centres gives the lower bound (GOGMA, arXiv
 1603.00150) and does not touch the proof.
 
+Where one field is asked over all motions, a *sweep* (`sweep`) bounds all boxes of equal size
+together first, and the best-first search starts from the few that it leaves.
+
 With ``SearchSettings.keep`` below 1 the search then goes on to the rivals: every box that could
 hold ``keep`` times the best value is followed until it is excluded or lies in the neighbourhood of
 an optimum that was met. So the optima listed in ``SearchOutcome.rivals`` come with a proven bound
@@ -38,10 +41,8 @@ of their surroundings, and ``upper_elsewhere`` bounds all other poses.
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,9 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration import kernels
 from uw_dslam_ros2.core.registration.result import PriorWindow, Progress
 from uw_dslam_ros2.core.registration.rivals import Neighborhoods
+from uw_dslam_ros2.core.registration.search_outcome import SearchOutcome, SearchSettings, Status
 from uw_dslam_ros2.core.registration.search_problem import Problem, Term, as_points
+from uw_dslam_ros2.core.registration.sweep import Sweep
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = [
@@ -69,59 +72,9 @@ FloatArray = NDArray[np.float64]
 _BOX_BYTES = 7 * 8 + 8 + 4
 _CHUNK = 2048  # boxes between two looks at the clock
 _MAX_OPTIMA = 512  # local optima remembered
-
-
-class Status(enum.Enum):
-    """Why a search ended."""
-
-    CERTIFIED = "certified"
-    BOXES = "boxes"
-    TIME = "time"
-    MEMORY = "memory"
-    CANCELLED = "cancelled"
-
-
-@dataclass(frozen=True, slots=True)
-class SearchSettings:
-    """When a search may end."""
-
-    gap: float = 0.01  # relative: (upper - lower) / upper
-    max_boxes: int = 10_000_000
-    max_seconds: float = math.inf  # counts only with a clock
-    max_memory_mb: float = 512.0  # of the open boxes
-    keep: float = 1.0  # share of the best value down to which rivals are looked for
-    rival_share: float = 1.0  # boxes for that, as a share of those that the proof took
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SearchOutcome:
-    """Pose and proof. Bounds are sums over all terms, not normalised."""
-
-    T_target_source: SE2
-    lower_bound: float  # value at the pose, less the rounding margin
-    upper_bound: float  # no pose of the window exceeds it
-    status: Status
-    num_boxes: int
-    num_open_boxes: int
-    seconds: float  # NaN without a clock
-    optima: FloatArray  # (F, 4): value, x, y, yaw of local optima met, best first, each pose once
-    rivals: (
-        FloatArray  # (R, 5): value, bound, x, y, yaw of other optima from `keep` on, best first
-    )
-    upper_elsewhere: float  # no pose beyond all neighbourhoods exceeds it
-    has_all_rivals: bool  # every pose above `keep` is in a neighbourhood, or uphill leads to one
-    neighborhoods: Neighborhoods
-
-    def upper_bound_near(self, T_target_source: SE2) -> float:
-        """Proven upper bound around a pose of the window: in its neighbourhood, or elsewhere."""
-        return min(self.upper_bound, self.neighborhoods.upper_bound(T_target_source))
-
-    @property
-    def gap(self) -> float:
-        """Relative gap, 0 where there is nothing to gain."""
-        return (
-            max(0.0, 1.0 - self.lower_bound / self.upper_bound) if self.upper_bound > 0.0 else 0.0
-        )
+_CELLS_PER_BOX = 32  # cells of a sweep that cost as much as a box
+_NUM_CENTRES = 24  # cells of each of its levels whose centres are looked at
+_NUM_CLIMBS = 4  # and of these, climbed from
 
 
 def objective_at(terms: Sequence[Term], T_target_source: SE2) -> float:
@@ -167,19 +120,25 @@ def search(
         problem.window[:3] = problem.from_pose(prior.T_target_source)
         problem.window[3] = min(prior.half_width_rad, math.pi)
         problem.window[4:] = prior.half_width_m
-    return _Search(problem, settings, clock).run(progress, is_cancelled, stage)
+    return _Search(problem, settings, clock, prior is None).run(progress, is_cancelled, stage)
 
 
 class _Search:
     """The arrays of one running search."""
 
     def __init__(
-        self, problem: Problem, settings: SearchSettings, clock: Callable[[], float] | None
+        self,
+        problem: Problem,
+        settings: SearchSettings,
+        clock: Callable[[], float] | None,
+        is_swept: bool,
     ) -> None:
         self._problem = problem
         self._settings = settings
         self._clock = clock
         self._start = clock() if clock else math.nan
+        self._is_swept = is_swept
+        self._num_cells = 0
         self._max_slots = max(64, int(settings.max_memory_mb * 1e6 / _BOX_BYTES))
         slots = min(8192, self._max_slots)
         self._boxes = np.empty((slots, 7))
@@ -205,6 +164,7 @@ class _Search:
     ) -> SearchOutcome:
         """Chunks of boxes until the proof is complete or a budget is used up; then the rivals."""
         max_boxes = self._settings.max_boxes
+        self._sweep(progress, is_cancelled, stage)
         status = self._chunks(0.0, max_boxes, progress, is_cancelled, stage)
         lower, upper = self._bounds()
         has_all_rivals = self._settings.keep >= 1.0
@@ -217,6 +177,50 @@ class _Search:
             has_all_rivals = ended is Status.CERTIFIED
         return self._outcome(status, lower, upper, has_all_rivals)
 
+    def _sweep(
+        self,
+        progress: Callable[[Progress], None] | None,
+        is_cancelled: Callable[[], bool] | None,
+        stage: str,
+    ) -> None:
+        """Put the boxes that a sweep leaves in place of the first one, if it fits the budgets."""
+        p, settings = self._problem, self._settings
+        if not (self._is_swept and Sweep.suits(p)):
+            return
+        max_cells = min(self._max_slots - 2, _CELLS_PER_BOX * settings.max_boxes // 4)
+        sweep = Sweep(p, max_cells, settings.max_memory_mb * 1e6 / 4.0)
+        while sweep.advance(self._floor() - p.margin, lambda: self._is_over(is_cancelled)):
+            kernels.climb(
+                p.points, p.rows, p.frames, p.coefficients, p.window, p.arm, p.reach,
+                sweep.highest(_NUM_CENTRES), _NUM_CLIMBS, self._best, self._found, self._counters,
+            )  # fmt: skip
+        self._num_cells = sweep.num_cells
+        if not sweep.num_cells:
+            return
+        boxes, uppers = sweep.boxes(self._floor() - p.margin)
+        count = len(boxes)
+        while len(self._heap) < count + 2:
+            self._grow()
+        # From the highest down, which is a heap.
+        self._boxes[:count, :6] = boxes
+        self._boxes[:count, 6] = kernels.UNSEEN
+        self._keys[:count] = np.minimum(uppers + p.margin, self._keys[0])
+        self._counters[kernels.NUM_OPEN] = count
+        self._counters[kernels.NUM_BOXES] = sweep.num_cells // _CELLS_PER_BOX
+        if progress:
+            progress(self._progress(stage))
+
+    def _is_over(self, is_cancelled: Callable[[], bool] | None) -> bool:
+        return self._is_late() or bool(is_cancelled and is_cancelled())
+
+    def _is_late(self) -> bool:
+        clock = self._clock
+        return clock is not None and clock() - self._start >= self._settings.max_seconds
+
+    def _floor(self) -> float:
+        """Bound below which nothing is of interest any more."""
+        return min(float(self._best[0]), self._settings.keep * float(self._best[0]))
+
     def _chunks(
         self,
         apart: float,
@@ -226,7 +230,7 @@ class _Search:
         stage: str,
     ) -> Status:
         """One phase: the proof with ``apart`` = 0, or that of the rivals."""
-        settings, counters = self._settings, self._counters
+        counters = self._counters
         while True:
             left = max_boxes - int(counters[kernels.NUM_BOXES])
             self._run_chunk(min(_CHUNK, max(left, 0)), apart)
@@ -239,7 +243,7 @@ class _Search:
                 status = Status.MEMORY
             elif counters[kernels.NUM_BOXES] >= max_boxes:
                 status = Status.BOXES
-            elif self._clock and self._clock() - self._start >= settings.max_seconds:
+            elif self._is_late():
                 status = Status.TIME
             if progress:
                 progress(self._progress(stage))
@@ -305,7 +309,7 @@ class _Search:
         found = np.vstack([[*self._best[:4], -math.inf], found])
         found = found[np.argsort(-found[:, 0], kind="stable")]
         neighborhoods = Neighborhoods.of(
-            p, found, max(self._top(), self._settings.keep * lower), float(self._best[5])
+            p, found, max(self._top(), self._floor()), float(self._best[5])
         )
         distinct = found[neighborhoods.apart_from_better(0.2 * p.reach)]
         poses = [p.to_pose(*row[1:4]) for row in distinct]
@@ -315,6 +319,7 @@ class _Search:
             upper_bound=upper,
             status=status,
             num_boxes=int(counters[kernels.NUM_BOXES]),
+            num_cells=self._num_cells,
             num_open_boxes=int(counters[kernels.NUM_OPEN]),
             seconds=self._clock() - self._start if self._clock else math.nan,
             optima=np.array(

@@ -12,6 +12,9 @@ hold them exactly. ``heap`` holds every slot of ``boxes`` once: the open ones as
 
 A box is (theta, x, y, half theta, half x, half y). The motion is ``p = R(theta) x + t`` for a
 forward term and ``p = R(theta)^T (y - t)`` for an inverse one.
+
+All of them stay in one file, long as it is: numba's cache of a compiled function looks at its own
+file only, and would go on using an old version of what it calls in another.
 """
 
 from __future__ import annotations
@@ -21,13 +24,16 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["ascend", "bound_first", "bound_second", "evaluate", "run"]
+__all__ = ["UNSEEN", "ascend", "bound_first", "bound_second", "climb", "evaluate", "run"]
 
+# In place of the axis to split: a box of a sweep, which curvature has not looked at.
+UNSEEN = 3
 # Slots of the search's counters, and what it stopped for.
 NUM_OPEN, NUM_BOXES, NUM_SECOND, NUM_FOUND, STATUS = range(5)
 DONE, CHUNK_ENDED, HEAP_FULL, FOUND_FULL = range(4)
 
 _LEARNING = 1.0 / 16.0
+_BOXES_PER_CLIMB = 10  # what one costs
 
 
 @njit(cache=True, nogil=True)
@@ -92,7 +98,17 @@ def bound_first(
         first, num_cols, plane = terms[t, 0], terms[t, 5], terms[t, 4] * terms[t, 5]
         at_windows = terms[t, 7]
         _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells)
-        for k in range(terms[t, 1] - first):
+        count = terms[t, 1] - first
+        if _find_corners(cells, count, num_cols, plane, half_of.shape[0]):
+            lows, rights, ups = cells[0], cells[1], cells[2]
+            for k in range(count):
+                total += points[2, first + k] * _largest_of(
+                    windows, at_windows + lows[k], rights[k], ups[k]
+                )
+                if k & 15 == 15 and total + points[3, first + k] <= floor:
+                    return total + points[3, first + k]
+            continue
+        for k in range(count):
             i0, j0 = np.int64(cells[0, k]), np.int64(cells[1, k])
             i1, j1 = np.int64(cells[2, k]), np.int64(cells[3, k])
             span = max(i1 - i0, j1 - j0)
@@ -127,6 +143,116 @@ def _largest(windows, at, plane, num_cols, half_of, i0, j0, i1, j1):
 
 
 @njit(cache=True, nogil=True)
+def _find_corners(cells, count, num_cols, plane, num_spans):
+    """Replace rectangles of cells by where their four windows are: the first, steps to the others.
+
+    Without branches, as above. False, and nothing is replaced, where one is too large.
+    """
+    i0s, j0s, i1s, j1s = cells[0], cells[1], cells[2], cells[3]
+    largest = np.int32(0)
+    for k in range(count):
+        largest = max(largest, max(i1s[k] - i0s[k], j1s[k] - j0s[k]))
+    if largest >= num_spans:
+        return False
+    cols, size_of_table = np.int32(num_cols), np.int32(plane)
+    for k in range(count):
+        i0, j0 = i0s[k], j0s[k]
+        width, height = i1s[k] - i0, j1s[k] - j0
+        span = max(width, height)
+        level = np.int32(span >= 1) + np.int32(span >= 3) + np.int32(span >= 7)
+        level += np.int32(span >= 15) + np.int32(span >= 31)
+        more = (1 << level) - 1
+        i0s[k] = level * size_of_table + j0 * cols + i0
+        j0s[k] = max(width - more, np.int32(0))
+        i1s[k] = max(height - more, np.int32(0)) * cols
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _largest_of(windows, at, right, up):
+    """Exact maximum over a rectangle of cells, from four overlapping windows.
+
+    Unsigned indices, for numba asks of signed ones whether they count from the end.
+    """
+    low, high = np.uint64(at), np.uint64(at + up)
+    step = np.uint64(right)
+    return max(max(windows[low], windows[low + step]), max(windows[high], windows[high + step]))
+
+
+@njit(cache=True, nogil=True)
+def _find_places(
+    points, first, count, is_inverse, cos, sin, tx, ty, scale, shift_x, shift_y, num_rows,
+    num_cols, cells, room,
+):  # fmt: skip
+    """Turned points, places between nodes, weights (0 outside) into ``room[:5]``.
+
+    The nodes go into ``cells[3]``.
+    """
+    xs, ys, weights = points[0, first:], points[1, first:], points[2, first:]
+    rxs, rys, us, vs, inside, nodes = room[0], room[1], room[2], room[3], room[4], cells[3]
+    origin_x, origin_y = 0.0, 0.0
+    if is_inverse:
+        origin_x, origin_y, sin = tx, ty, -sin
+    right, top, cols = num_cols - 1.0, num_rows - 1.0, float(num_cols)
+    # Several loops of few arrays each: the compiler gives up on telling many apart.
+    for k in range(count):
+        x, y = xs[k] - origin_x, ys[k] - origin_y
+        rxs[k], rys[k] = cos * x - sin * y, sin * x + cos * y
+    for k in range(count):
+        us[k], vs[k] = rxs[k] * scale + shift_x, rys[k] * scale + shift_y
+    for k in range(count):
+        u, v = us[k], vs[k]
+        is_inside = (u >= 1.0) & (u < right) & (v >= 1.0) & (v < top)
+        inside[k] = weights[k] if is_inside else 0.0
+    for k in range(count):
+        u, v = us[k], vs[k]
+        i, j = np.floor(min(max(u, 1.0), right - 1.0)), np.floor(min(max(v, 1.0), top - 1.0))
+        us[k], vs[k] = u - 0.5 - i, v - 0.5 - j
+        nodes[k] = np.int32((j - 1.0) * cols + i - 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _fill_splines(coefficients, at, num_cols, scale, count, nodes, room):
+    """Weighted values and slopes of the field into ``room[5:8]``."""
+    at, cols = np.uint64(at), np.uint64(num_cols)
+    one, two, twice = np.uint64(1), np.uint64(2), np.uint64(2 * num_cols)
+    n00, n01, n02, n10, n11 = room[5], room[6], room[7], room[8], room[9]
+    n12, n20, n21, n22 = room[10], room[11], room[12], room[13]
+    for k in range(count):
+        low = at + np.uint64(nodes[k])
+        mid, high = low + cols, low + twice
+        n00[k], n01[k], n02[k] = (
+            coefficients[low],
+            coefficients[low + one],
+            coefficients[low + two],
+        )
+        n10[k], n11[k], n12[k] = (
+            coefficients[mid],
+            coefficients[mid + one],
+            coefficients[mid + two],
+        )
+        n20[k], n21[k] = coefficients[high], coefficients[high + one]
+        n22[k] = coefficients[high + two]
+    along, across, weights = room[2], room[3], room[4]
+    for k in range(count):
+        a, b, weight = along[k], across[k], weights[k]
+        a0, a1, a2 = 0.5 * (0.5 - a) * (0.5 - a), 0.75 - a * a, 0.5 * (0.5 + a) * (0.5 + a)
+        b0, b1, b2 = 0.5 * (0.5 - b) * (0.5 - b), 0.75 - b * b, 0.5 * (0.5 + b) * (0.5 + b)
+        c00, c01, c02, c10, c11 = n00[k], n01[k], n02[k], n10[k], n11[k]
+        c12, c20, c21, c22 = n12[k], n20[k], n21[k], n22[k]
+        line0 = a0 * c00 + a1 * c01 + a2 * c02
+        line1 = a0 * c10 + a1 * c11 + a2 * c12
+        line2 = a0 * c20 + a1 * c21 + a2 * c22
+        slope0 = (0.5 + a) * (c02 - c01) + (0.5 - a) * (c01 - c00)
+        slope1 = (0.5 + a) * (c12 - c11) + (0.5 - a) * (c11 - c10)
+        slope2 = (0.5 + a) * (c22 - c21) + (0.5 - a) * (c21 - c20)
+        rise = (0.5 + b) * (line2 - line1) + (0.5 - b) * (line1 - line0)
+        n00[k] = weight * (b0 * line0 + b1 * line1 + b2 * line2)
+        n01[k] = weight * scale * (b0 * slope0 + b1 * slope1 + b2 * slope2)
+        n02[k] = weight * scale * rise
+
+
+@njit(cache=True, nogil=True)
 def _spline(coefficients, at, num_cols, a, b):
     """Value, slopes and second derivatives, in cells, of the spline at (a, b) from a node."""
     a0, a1, a2 = 0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2
@@ -154,11 +280,12 @@ def _spline(coefficients, at, num_cols, a, b):
 
 
 @njit(cache=True, nogil=True)
-def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, out, cells):
+def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, out, cells, room):
     """Upper bound over a small box from value, summed gradient and bounded curvature.
 
     ``out``: the bound, the value at the centre, and the rise that theta, x and y can bring. The
-    bound is infinite where the box is too large for the tables.
+    bound is infinite where the box is too large for the tables. ``cells`` (4, K) of int32 and
+    ``room`` (14, K) are scratch.
     """
     cos, sin, swing, bow = _turn(box)
     tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
@@ -176,34 +303,30 @@ def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, 
             shift_x, shift_y = shift_x + scale * tx, shift_y + scale * ty
         s0, sx, sy, s_theta, s_radial = 0.0, 0.0, 0.0, 0.0, 0.0
         la, lx, ly, lc = 0.0, 0.0, 0.0, 0.0
-        first = terms[t, 0]
+        first, count = terms[t, 0], terms[t, 1] - terms[t, 0]
         _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells)
-        for k in range(first, terms[t, 1]):
-            i0, j0 = np.int64(cells[0, k - first]), np.int64(cells[1, k - first])
-            i1, j1 = np.int64(cells[2, k - first]), np.int64(cells[3, k - first])
-            if max(i1 - i0, j1 - j0) >= half_of.shape[0]:
-                return
-            x, y, weight = points[0, k], points[1, k], points[2, k]
-            if is_inverse:
-                rx = cos * (x - tx) + sin * (y - ty)
-                ry = cos * (y - ty) - sin * (x - tx)
-            else:
-                rx, ry = cos * x - sin * y, sin * x + cos * y
-            curvature = weight * _largest(
-                curvatures, at_curvatures, plane, num_cols, half_of, i0, j0, i1, j1
+        if not _find_corners(cells, count, num_cols, plane, half_of.shape[0]):
+            return
+        _find_places(
+            points, first, count, is_inverse, cos, sin, tx, ty, scale, shift_x, shift_y,
+            num_rows, num_cols, cells, room,
+        )  # fmt: skip
+        _fill_splines(coefficients, at_coefficients, num_cols, scale, count, cells[3], room)
+        bends, weights = room[8], points[2, first:]
+        lows, rights, ups = cells[0], cells[1], cells[2]
+        for k in range(count):
+            bends[k] = weights[k] * _largest_of(
+                curvatures, at_curvatures + lows[k], rights[k], ups[k]
             )
+        rxs, rys, values, slopes_x, slopes_y = room[0], room[1], room[5], room[6], room[7]
+        for k in range(count):
+            rx, ry, curvature = rxs[k], rys[k], bends[k]
+            fx, fy = slopes_x[k], slopes_y[k]
             la += curvature
             lx += curvature * rx
             ly += curvature * ry
             lc += curvature * (rx * rx + ry * ry)
-            u, v = rx * scale + shift_x, ry * scale + shift_y
-            if not (1.0 <= u < num_cols - 1 and 1.0 <= v < num_rows - 1):
-                continue
-            i, j = int(u), int(v)
-            at = at_coefficients + (j - 1) * num_cols + i - 1
-            field, fx, fy, _, _, _ = _spline(coefficients, at, num_cols, u - 0.5 - i, v - 0.5 - j)
-            fx, fy = weight * scale * fx, weight * scale * fy
-            s0 += weight * field
+            s0 += values[k]
             sx += fx
             sy += fy
             s_theta += fy * rx - fx * ry
@@ -456,18 +579,18 @@ def _axis_to_split(box, arm, out):
 
 
 @njit(cache=True, nogil=True)
-def _owner(found, count, box, arm, radius):
+def _owner(found, count, theta, x, y, half_theta, half_x, half_y, arm, radius):
     """Best optimum in whose neighbourhood a box lies entirely, -1 if there is none."""
     owner = -1
     for k in range(count):
         if owner >= 0 and found[k, 0] <= found[owner, 0]:
             continue
-        if abs(found[k, 2] - box[1]) + box[4] > radius:
+        if abs(found[k, 2] - x) + half_x > radius:
             continue
-        if abs(found[k, 3] - box[2]) + box[5] > radius:
+        if abs(found[k, 3] - y) + half_y > radius:
             continue
-        turn = abs(found[k, 1] - box[0]) % (2.0 * math.pi)
-        if arm * (min(turn, 2.0 * math.pi - turn) + box[3]) <= radius:
+        turn = abs(found[k, 1] - theta) % (2.0 * math.pi)
+        if arm * (min(turn, 2.0 * math.pi - turn) + half_theta) <= radius:
             owner = k
     return owner
 
@@ -476,9 +599,7 @@ def _owner(found, count, box, arm, radius):
 def _note(found, counters, value, pose, arm, radius):
     """Index of an optimum in the list, added if it is new; -1 where the list is full."""
     count = counters[NUM_FOUND]
-    at = np.zeros(6)
-    at[:3] = pose
-    k = _owner(found, count, at, arm, radius)
+    k = _owner(found, count, pose[0], pose[1], pose[2], 0.0, 0.0, 0.0, arm, radius)
     if k < 0:
         if count == found.shape[0]:
             return -1
@@ -488,20 +609,52 @@ def _note(found, counters, value, pose, arm, radius):
         found[k, 4] = -math.inf
     if value > found[k, 0]:
         found[k, 0] = value
-        found[k, 1:4] = pose
+        found[k, 1:4] = pose[:3]
     return k
 
 
 @njit(cache=True, nogil=True)
-def _is_worth_a_climb(value, best, found, counters, box, arm, reach):
-    """Whether a centre is good, and not beside an optimum already known unless better than all."""
-    if value > best[0]:
-        return True
-    if value <= best[4] * best[0]:
-        return False
-    at = np.zeros(6)
-    at[:3] = box[:3]
-    return _owner(found, counters[NUM_FOUND], at, arm, reach) < 0
+def _try_climb(
+    points, terms, frames, coefficients, window, arm, reach, value, box, best, found, counters,
+    work,
+):  # fmt: skip
+    """Climb from a centre of that value, unless it is poor or beside a known, better optimum."""
+    if value <= best[0]:
+        if value <= best[4] * best[0]:
+            return
+        count = counters[NUM_FOUND]
+        if _owner(found, count, box[0], box[1], box[2], 0.0, 0.0, 0.0, arm, reach) >= 0:
+            return
+    pose = work[10]
+    pose[:] = box[:3]
+    top = ascend(
+        points, terms, frames, coefficients, window, arm, reach, pose, 30, 1e-8, work[:10]
+    )
+    _note(found, counters, top, pose, arm, 0.2 * reach)
+    if top > best[0]:
+        best[0] = top
+        best[1:4] = pose
+        best[4] = 0.3
+    else:
+        # The more climbs fail, the better a centre has to be for the next.
+        best[4] += 0.1 * (1.0 - best[4])
+
+
+@njit(cache=True, nogil=True)
+def climb(
+    points, terms, frames, coefficients, window, arm, reach, boxes, max_climbs, best, found,
+    counters,
+):  # fmt: skip
+    """Climb from the best centres of some boxes (K, 6)."""
+    work, values = np.empty((11, 3)), np.empty(boxes.shape[0])
+    for k in range(boxes.shape[0]):
+        values[k] = evaluate(points, terms, frames, coefficients, boxes[k, :3], work[0], work[4:7])
+    order = np.argsort(-values)
+    for k in order[:max_climbs]:
+        _try_climb(
+            points, terms, frames, coefficients, window, arm, reach, values[k], boxes[k], best,
+            found, counters, work,
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -523,29 +676,38 @@ def run(
     is followed until it is discarded or lies in the neighbourhood, of that radius, of an optimum;
     what is still above as a box of a cell belongs to the optimum that a climb from there leads to.
     """
-    out, work = np.empty(5), np.empty((10, 3))
+    out, work = np.empty(5), np.empty((11, 3))
     child, pose = np.zeros(6), np.zeros(3)
-    cells = np.empty((4, points.shape[1]), np.int32)
+    cells, room = np.empty((4, points.shape[1]), np.int32), np.empty((14, points.shape[1]))
     near = 0.2 * reach
     budget = counters[NUM_BOXES] + max_boxes
     counters[STATUS] = DONE
     while counters[NUM_OPEN] > 0:
         top = heap[0]
+        is_unseen = boxes[top, 6] == UNSEEN
         if radius > 0.0:
             if keys[top] <= keep * best[0]:
                 return
-            owner = _owner(found, counters[NUM_FOUND], boxes[top], arm, radius)
-            size = max(boxes[top, 3] * arm, max(boxes[top, 4], boxes[top, 5]))
-            is_small = size <= 0.2 * reach
+            box = boxes[top]
+            owner = _owner(
+                found, counters[NUM_FOUND], box[0], box[1], box[2], box[3], box[4], box[5], arm,
+                radius,
+            )  # fmt: skip
+            is_small = not is_unseen and max(box[3] * arm, max(box[4], box[5])) <= near
             if owner < 0 and is_small:
-                pose[:] = boxes[top, :3]
+                pose[:] = box[:3]
                 value = ascend(
-                    points, terms, frames, coefficients, window, arm, reach, pose, 50, 1e-6, work
-                )
+                    points, terms, frames, coefficients, window, arm, reach, pose, 50, 1e-6,
+                    work[:10],
+                )  # fmt: skip
                 owner = _note(found, counters, value, pose, arm, near)
                 if owner < 0:
                     counters[STATUS] = FOUND_FULL
                     return
+                counters[NUM_BOXES] += _BOXES_PER_CLIMB
+                if value > best[0]:
+                    best[0] = value
+                    best[1:4] = pose
                 best[5] = max(best[5], keys[top])
             # Around the best, the bound of all is the bound; around others it is worth some boxes.
             if owner >= 0 and (
@@ -570,16 +732,19 @@ def run(
         parent_key = keys[top]
         axis = int(boxes[top, 6])
         child[:] = boxes[top, :6]
-        child[axis + 3] *= 0.5
-        centre = child[axis]
-        for side in range(2):
-            child[axis] = centre + (2 * side - 1) * child[axis + 3]
+        centre = 0.0
+        if not is_unseen:
+            child[axis + 3] *= 0.5
+            centre = child[axis]
+        for side in range(1 if is_unseen else 2):
             floor = min(best[0], keep * best[0])
-            upper = bound_first(
-                points, terms, frames, levels, level_of, half_of, bounds, windows, child,
-                floor - margin, cells,
-            )  # fmt: skip
-            first = upper + margin
+            first = parent_key
+            if not is_unseen:
+                child[axis] = centre + (2 * side - 1) * child[axis + 3]
+                first = margin + bound_first(
+                    points, terms, frames, levels, level_of, half_of, bounds, windows, child,
+                    floor - margin, cells,
+                )  # fmt: skip
             upper = min(parent_key, first)
             counters[NUM_BOXES] += 1
             out[0] = math.inf
@@ -591,30 +756,20 @@ def run(
             is_tried = radius > 0.0 or worth[level] > 0.7 or counters[NUM_BOXES] & 14 == 0
             # In the first phase, what lies below the best is only kept for the second.
             wanted = floor if radius > 0.0 else best[0]
-            if upper > wanted and size <= small and is_tried:
+            if upper > wanted and size <= small and (is_tried or is_unseen):
                 bound_second(
-                    points, terms, frames, half_of, coefficients, curvatures, child, out, cells
-                )
+                    points, terms, frames, half_of, coefficients, curvatures, child, out, cells,
+                    room,
+                )  # fmt: skip
                 counters[NUM_SECOND] += 1
                 gain = (first - max(out[0] + margin, wanted)) / (first - wanted)
                 worth[level] += _LEARNING * (max(gain, 0.0) - worth[level])
                 upper = min(upper, out[0] + margin)
-                if upper > wanted and _is_worth_a_climb(
-                    out[1], best, found, counters, child, arm, reach
-                ):
-                    pose[:] = child[:3]
-                    value = ascend(
-                        points, terms, frames, coefficients, window, arm, reach, pose, 30, 1e-8,
-                        work,
+                if upper > wanted:
+                    _try_climb(
+                        points, terms, frames, coefficients, window, arm, reach, out[1], child,
+                        best, found, counters, work,
                     )  # fmt: skip
-                    _note(found, counters, value, pose, arm, near)
-                    if value > best[0]:
-                        best[0] = value
-                        best[1:4] = pose
-                        best[4] = 0.3
-                    else:
-                        # The more climbs fail, the better a centre has to be for the next.
-                        best[4] += 0.1 * (1.0 - best[4])
                 if out[1] > best[0]:
                     best[0] = out[1]
                     best[1:4] = child[:3]
