@@ -7,6 +7,8 @@ from itertools import pairwise
 import pytest
 
 from uw_dslam_ros2.cli.studies import field, sigma, verdict
+from uw_dslam_ros2.cli.studies._ceiling import best_with_known_noise
+from uw_dslam_ros2.cli.studies._common import is_success
 from uw_dslam_ros2.cli.studies._trials import Cell
 from uw_dslam_ros2.cli.study import build_parser, main, study_names
 
@@ -176,3 +178,9 @@ def test_outliers_refuses_a_cell_that_is_not_there(tmp_path, capsys):
     arguments = ["--only", "paper", "--cells", "outliers 41%"]
     assert main(["outliers", "--out", str(tmp_path), *arguments]) == 1
     assert "outliers 41%" in capsys.readouterr().err
+
+
+def test_knowing_noise_and_overlap_finds_what_is_there():
+    for seed in range(3):
+        problem = Cell(25, 0.0, 0.02, 0.6).problem(seed)
+        assert is_success(best_with_known_noise(problem), problem.T_target_source)

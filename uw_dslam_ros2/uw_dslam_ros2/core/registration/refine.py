@@ -20,7 +20,7 @@ from uw_dslam_ros2.core.registration.point_evidence import EvidenceModel
 from uw_dslam_ros2.core.registration.refinement import Refinement
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["PointModel", "evaluate_pose", "polish", "refine"]
+__all__ = ["PointModel", "evaluate_pose", "fit_known", "polish", "refine"]
 
 FloatArray = NDArray[np.float64]
 
@@ -102,6 +102,19 @@ def evaluate_pose(model: PointModel, pose: SE2, sigma_m: float) -> Refinement:
     """What the points say about a pose as it is."""
     num_pairs = _START_SHARE * min(len(model.source), len(model.target))
     return _climb(model, pose.as_array()[[2, 0, 1]], sigma_m, num_pairs, model.max_sigma_m, 0)
+
+
+def fit_known(
+    model: PointModel, parameters: FloatArray, sigma_m: float, num_pairs: float
+) -> Refinement:
+    """Climb in the pose (theta, x, y) alone: noise and number of pairs are known.
+
+    The model's smallest and largest noise have to be `sigma_m`. The climb estimates the number of
+    pairs; what it ends at is then evaluated with the known one.
+    """
+    num_pairs = min(num_pairs, 0.98 * min(len(model.source), len(model.target)))
+    pose = _climb(model, parameters, sigma_m, num_pairs, sigma_m, 60, 1e-4).parameters
+    return _climb(model, pose, sigma_m, num_pairs, sigma_m, 0)
 
 
 def _climb(
