@@ -206,16 +206,22 @@ def _draw(path: Path, pair: MapPair, motions: dict[str, SE2 | None]) -> None:
     shown = {"truth": pair.T_target_source, **motions}
     picture, grid = figure(2, 4, width=11.0, height=6.0)
     lattice = _lattice(pair)
+    corners = []  # of all outlines, so that all pictures show the same part of the lattice
     for axes, (name, motion) in zip(grid.ravel(), shown.items(), strict=False):
         values = _merged(pair, motion).values
         grey = np.where(values < 0, 0.7, np.where(values > 50, 0.0, 1.0))
         axes.imshow(grey, cmap="gray", vmin=0.0, vmax=1.0, origin="lower")
         outlines = [(pair.target, SE2())] + ([(pair.source, motion)] if motion else [])
         for occupancy, T_target_map in outlines:
-            corners = T_target_map.apply(occupancy.spec.corners())
-            cells = lattice.T_frame_grid.inverse().apply(corners) / lattice.resolution_m
-            closed = np.vstack([cells, cells[:1]])
+            metres = T_target_map.apply(occupancy.spec.corners())
+            corners.append(lattice.T_frame_grid.inverse().apply(metres) / lattice.resolution_m)
+            closed = np.vstack([corners[-1], corners[-1][:1]])
             axes.plot(closed[:, 0], closed[:, 1], "r:", linewidth=1.0)
         axes.set_title(name if motion is not None else f"{name}: refused", fontsize=8)
         axes.set_axis_off()
+    low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+    low, high = np.maximum(low - 5.0, 0.0), np.minimum(high + 5.0, lattice.shape[::-1])
+    for axes in grid.ravel():
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
     save_figure(picture, path)
