@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration import field_kernels
 
-__all__ = ["lattice_maxima"]
+__all__ = ["lattice_maxima", "likelihood_raster", "sum_shifted"]
 
 FloatArray = NDArray[np.float64]
 
@@ -101,13 +101,18 @@ def _apart(poses: FloatArray, arm_m: float, distance_m: float, count: int) -> Fl
 
 
 @njit(cache=True, nogil=True)
-def add_shifted(raster, col, row, total):  # type: ignore[no-untyped-def]
+def _add_shifted(raster, col, row, total):  # type: ignore[no-untyped-def]
     """Add the part of a raster that starts at (row, col) onto `total`; what is outside is zero."""
     first_row, last_row = max(0, -row), min(total.shape[0], raster.shape[0] - row)
     first_col, last_col = max(0, -col), min(total.shape[1], raster.shape[1] - col)
+    if first_col >= last_col:
+        return
     for y in range(first_row, last_row):
-        for x in range(first_col, last_col):
-            total[y, x] += raster[row + y, col + x]
+        # Slices, whose indices cannot be negative, so that the compiler uses vector instructions.
+        line = total[y, first_col:last_col]
+        other = raster[row + y, col + first_col : col + last_col]
+        for x in range(line.shape[0]):
+            line[x] += other[x]
 
 
 @njit(cache=True, nogil=True)
@@ -122,7 +127,7 @@ def _scan(source, raster, origin, pitch, start, rows, columns, thetas, values, p
             px = cos * source[i, 0] - sin * source[i, 1] + start[0] - origin[0]
             py = sin * source[i, 0] + cos * source[i, 1] + start[1] - origin[1]
             col, row = math.floor(px / pitch + 0.5), math.floor(py / pitch + 0.5)
-            add_shifted(raster, col, row, total)
+            _add_shifted(raster, col, row, total)
         for y in range(1, rows - 1):
             for x in range(1, columns - 1):
                 value = total[y, x]
@@ -143,3 +148,18 @@ def _scan(source, raster, origin, pitch, start, rows, columns, thetas, values, p
                 poses[count, 1], poses[count, 2] = start[0] + x * pitch, start[1] + y * pitch
                 count += 1
     return count
+
+
+@njit(cache=True, nogil=True)
+def sum_shifted(raster, places, rows, columns):  # type: ignore[no-untyped-def]
+    """Sum, and sum of squares, of a raster read from each of the places (K, 2) of column, row on.
+
+    Both are (rows, columns); outside the raster is zero.
+    """
+    total = np.zeros((rows, columns), dtype=np.float32)
+    squares = np.zeros((rows, columns), dtype=np.float32)
+    square = raster * raster
+    for i in range(places.shape[0]):
+        _add_shifted(raster, places[i, 0], places[i, 1], total)
+        _add_shifted(square, places[i, 0], places[i, 1], squares)
+    return total, squares

@@ -43,11 +43,20 @@ class Outline:
         # The share of the region that the hull leaves out is, on average, that of the corners.
         growth = math.sqrt(1.0 / (1.0 - min(len(corners) / (count + 1.0), 0.75)))
         outline = cls._around(middle + growth * (corners - middle), hull.volume * growth**2)
-        box = cls._box(points)
-        return outline if outline.area_m2 > box.area_m2 / count else box
+        low, high = cls._extent(points)[1:]
+        return outline if outline.area_m2 > (high - low).prod() / count else cls._box(points)
 
     @classmethod
     def _box(cls, points: FloatArray) -> Outline:
+        axes, low, high = cls._extent(points)
+        corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes.T
+        if np.linalg.det(axes) < 0.0:
+            corners = corners[::-1]
+        return cls._around(points.mean(axis=0) + corners, float((high - low).prod()))
+
+    @staticmethod
+    def _extent(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Main axes (2, 2), and ends (2,) along them from the mean, never without width."""
         middle = points.mean(axis=0)
         spread = points - middle
         axes = np.linalg.eigh(spread.T @ spread)[1]
@@ -55,11 +64,7 @@ class Outline:
         low, high = along.min(axis=0), along.max(axis=0)
         sides = np.maximum(high - low, 1e-9)
         width = np.maximum(sides, sides.max() / max(len(points), 4))
-        low, high = 0.5 * (low + high - width), 0.5 * (low + high + width)
-        corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes.T
-        if np.linalg.det(axes) < 0.0:
-            corners = corners[::-1]
-        return cls._around(middle + corners, float(width.prod()))
+        return axes, 0.5 * (low + high - width), 0.5 * (low + high + width)
 
     @classmethod
     def _around(cls, corners: FloatArray, area_m2: float) -> Outline:
@@ -72,7 +77,7 @@ class Outline:
 
     def holds(self, points: FloatArray) -> NDArray[np.bool_]:
         """Mask (N,) of the points (N, 2) inside."""
-        return np.asarray((points @ self.normals.T >= self.offsets).all(axis=1))
+        return np.asarray((self.normals @ points.T >= self.offsets[:, None]).all(axis=0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from uw_dslam_ros2.core.registration.branch_and_bound import (
-    Problem,
-    SearchOutcome,
-    Status,
-    Term,
-)
+from uw_dslam_ros2.core.registration.branch_and_bound import SearchOutcome, Status, Term
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
 from uw_dslam_ros2.core.registration.point_evidence import EvidenceModel
 from uw_dslam_ros2.core.registration.point_input import Cloud, Pair
 from uw_dslam_ros2.core.registration.point_rivals import log_contributions, log_odds
-from uw_dslam_ros2.core.registration.point_verdict import PoseHypothesis, decide_points
+from uw_dslam_ros2.core.registration.point_verdict import (
+    PoseHypothesis,
+    decide_points,
+    posterior,
+)
 from uw_dslam_ros2.core.registration.refinement import Refinement
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Rival, Verdict
 from uw_dslam_ros2.core.se2 import SE2
@@ -64,7 +63,7 @@ def packed(
     gap = max(0.0, 1.0 - lower / upper) if upper > 0.0 else 0.0
     covariance = evidence.repetition * best.covariance()
     verdict, reason, probability = decide_points(
-        _hypotheses(candidates, evidence),
+        _hypotheses(candidates, evidence, config.min_probability),
         is_complete=outcome.status is Status.CERTIFIED,
         gap=gap,
         spacing_m=evidence.spacing_m,
@@ -99,22 +98,31 @@ def packed(
     )
 
 
-def _hypotheses(candidates: Sequence[Candidate], evidence: EvidenceModel) -> list[PoseHypothesis]:
+def _hypotheses(
+    candidates: Sequence[Candidate], evidence: EvidenceModel, min_probability: float
+) -> list[PoseHypothesis]:
     """What the verdict asks of the poses, the best first."""
     area_m2 = evidence.target_outline.area_m2
     most = min(len(evidence.source), len(evidence.target))
+
+    def contributions(refinement: Refinement) -> FloatArray:
+        return log_contributions(evidence.source, evidence.target, refinement, area_m2)
+
     found: list[PoseHypothesis] = []
-    first = log_contributions(evidence.source, evidence.target, candidates[0][1], area_m2)
+    first: FloatArray | None = None
+    is_poor = posterior([candidates[0][0]]) < min_probability
     for k, (own, refinement) in enumerate(candidates):
         odds = -math.inf
-        if 0 < k < _MAX_COMPARED:
-            other = log_contributions(evidence.source, evidence.target, refinement, area_m2)
-            odds = log_odds(first, other, evidence.repetition)
+        # Only a rival that convinces by itself counts, or any where the best does not.
+        if 0 < k < _MAX_COMPARED and (is_poor or posterior([own]) >= min_probability):
+            first = contributions(candidates[0][1]) if first is None else first
+            odds = log_odds(first, contributions(refinement), evidence.repetition)
+        is_independent = evidence.repetition == 1.0
         found.append(
             PoseHypothesis(
                 evidence=own,
                 covariance=evidence.repetition * refinement.covariance(),
-                independent_evidence=evidence.of(refinement, 1.0),
+                independent_evidence=own if is_independent else evidence.of(refinement, 1.0),
                 pair_share=refinement.num_pairs / most,
                 log_odds=odds,
             )
@@ -130,7 +138,7 @@ def _is_line(points: FloatArray) -> bool:
 
 def _values(rung: Rung, poses: Sequence[SE2]) -> list[float]:
     """What the search's objective says of poses."""
-    problem = Problem(rung.terms)
+    problem = rung.outcome.neighborhoods.problem
     return [problem.value_at(problem.from_pose(pose))[0] for pose in poses]
 
 

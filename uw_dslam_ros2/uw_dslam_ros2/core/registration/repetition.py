@@ -12,10 +12,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.registration.lattice_scan import add_shifted, likelihood_raster
+from uw_dslam_ros2.core.registration.lattice_scan import likelihood_raster, sum_shifted
 from uw_dslam_ros2.core.registration.point_evidence import Outline
 
 __all__ = ["design_effect"]
@@ -68,7 +67,7 @@ def design_effect(
     start = middle - half
     num_columns, num_rows = (np.ceil(2.0 * half / pitch_m) + 1.0).astype(np.int64)
     places = np.floor((turned + start - origin) / pitch_m + 0.5).astype(np.int64)
-    total, single = _sums(centred, places, num_rows, num_columns)
+    total, single = sum_shifted(centred, places, num_rows, num_columns)
     x = start[0] + pitch_m * np.arange(num_columns) - translation[0]
     y = start[1] + pitch_m * np.arange(num_rows) - translation[1]
     is_far = x[None, :] ** 2 + y[:, None] ** 2 > (_EXCLUDED * sigma_m) ** 2
@@ -77,15 +76,3 @@ def design_effect(
         return 1.0
     ratio = float((total[is_far].astype(np.float64) ** 2).sum()) / expected
     return max(ratio / (1.0 + _SCATTER / math.sqrt(min(len(turned), len(target)))), 1.0)
-
-
-@njit(cache=True, nogil=True)
-def _sums(raster, places, rows, columns):  # type: ignore[no-untyped-def]
-    """Sum over the points, and sum of squares, at every translation."""
-    total = np.zeros((rows, columns), dtype=np.float32)
-    single = np.zeros((rows, columns), dtype=np.float32)
-    square = raster * raster
-    for i in range(places.shape[0]):
-        add_shifted(raster, places[i, 0], places[i, 1], total)
-        add_shifted(square, places[i, 0], places[i, 1], single)
-    return total, single

@@ -170,7 +170,7 @@ class Sweep:
                 return False
             sweep_kernels.add_slabs(
                 p.points, p.frames[0], tables, level.base, pad, self._field.maximum, self._slack,
-                p.window[0] - math.pi + level.delta, level.delta, level.origin,
+                self._first_theta(level), level.delta, level.origin,
                 nodes[k : k + size], offsets[k : k + size + 1], sums,
             )  # fmt: skip
         return True
@@ -197,13 +197,12 @@ class Sweep:
 
     def _boxes_of(self, cells: IntArray) -> FloatArray:
         """By their index in all sums."""
-        level = self._levels[self._at]
-        node = np.searchsorted(self._offsets, cells, side="right") - 1
-        slab, j0, _, i0, i1 = self._nodes[node].T
-        y, x = np.divmod(cells - self._offsets[node], i1 - i0)
-        boxes = np.empty((len(cells), 6))
-        boxes[:, 0] = self._problem.window[0] - math.pi + level.delta * (2 * slab + 1)
-        boxes[:, 1] = level.origin[0] + 2.0 * level.half_m * (i0 + x)
-        boxes[:, 2] = level.origin[1] + 2.0 * level.half_m * (j0 + y)
-        boxes[:, 3], boxes[:, 4:] = level.delta, level.half_m
+        level, boxes = self._levels[self._at], np.empty((len(cells), 6))
+        sweep_kernels.fill_boxes(
+            cells, self._nodes, self._offsets, self._first_theta(level), level.delta,
+            level.origin, level.half_m, boxes,
+        )  # fmt: skip
         return boxes
+
+    def _first_theta(self, level: _Level) -> float:
+        return float(self._problem.window[0]) - math.pi + level.delta

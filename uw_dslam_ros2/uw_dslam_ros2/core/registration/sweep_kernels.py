@@ -20,7 +20,7 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["SMALLEST", "add_slabs", "fill_tables", "highest", "split_nodes"]
+__all__ = ["SMALLEST", "add_slabs", "fill_boxes", "fill_tables", "highest", "split_nodes"]
 
 SMALLEST = 3  # bases that two bases can touch, at least
 
@@ -198,6 +198,19 @@ def highest(sums, cells):
             k -= 1
         cells[k] = at
         count = min(count + 1, cells.shape[0])
+
+
+@njit(cache=True, nogil=True)
+def fill_boxes(cells, nodes, offsets, first_theta, delta, origin, half_m, boxes):
+    """Boxes (K, 6) of cells (K,), which are given by their index in all sums."""
+    for k in range(cells.shape[0]):
+        n = np.searchsorted(offsets, cells[k], side="right") - 1
+        at, width = cells[k] - offsets[n], nodes[n, 4] - nodes[n, 3]
+        boxes[k, 0] = first_theta + 2.0 * nodes[n, 0] * delta
+        boxes[k, 1] = origin[0] + 2.0 * half_m * (nodes[n, 3] + at % width)
+        boxes[k, 2] = origin[1] + 2.0 * half_m * (nodes[n, 1] + at // width)
+        boxes[k, 3] = delta
+        boxes[k, 4], boxes[k, 5] = half_m, half_m
 
 
 @njit(cache=True, nogil=True)
