@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--points", type=int, default=100, help="m (default: %(default)s)")
     parser.add_argument(
         "--only",
-        choices=("paper", "outliers", "noise", "points", "hard"),
+        choices=("paper", "outliers", "noise", "points", "accuracy", "hard"),
         action="append",
         help="run this part alone (may be given again; default: all)",
     )
@@ -106,12 +106,16 @@ def _parts(num_points: int) -> dict[str, tuple[list[Cell], Report]]:
     m = num_points
     hard = [Cell(k, 0.9, 0.05) for k in (50, 100, 200)]
     hard += [Cell(k, 0.0, 0.05, 0.3) for k in (50, 100, 200)]
-    hard += [Cell(50, 0.0, 0.02, 0.2), Cell(m, 0.0, 0.01, 0.5), Cell(m, 0.0, 0.01, 0.3)]
+    hard += [Cell(50, 0.0, 0.02, 0.2)]
+    accuracy = [Cell(m, o) for o in (0.33, 0.5, 0.8)]
+    accuracy += [Cell(m, o, 0.02) for o in (0.5, 0.8, 0.9)]
+    accuracy += [Cell(m, 0.0, 0.01, common) for common in (0.5, 0.3)]
     return {
         "paper": ([Cell(m, o, noise) for o, noise, _, _ in _PAPER_CASES.values()], _paper),
         "outliers": ([Cell(m, o, n) for n in (0.0, 0.02) for o in _OUTLIERS], _sweep("outliers")),
         "noise": ([Cell(m, 0.5, noise) for noise in _NOISE], _sweep("noise_m")),
         "points": ([Cell(k, 0.5, 0.0) for k in _POINTS], _sweep("points")),
+        "accuracy": (accuracy, _table_by_cell),
         "hard": (hard, _table_by_cell),
     }
 
