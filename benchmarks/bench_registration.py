@@ -229,31 +229,46 @@ def exponent(quick: bool) -> None:
 
 
 def breakdown(quick: bool) -> None:
-    """Boxes per second, where the time goes, and the floor of one look-up per point and box."""
-    for m, share in ((50, 0.0), (200, 0.5)):
-        tables, searched, boxes = Timing(), Timing(), 0
+    """Boxes per second, together and one by one; where the chain's time goes; floors."""
+    for m, share in ((50, 0.0), (100, 0.5), (200, 0.5)):
+        tables, searched, chain, boxes, cells = Timing(), Timing(), Timing(), [], []
         for seed in range(3 if quick else 20):
             problem = outlier_problem(m, share, seed=seed)
-            n = len(problem.target)
             field = timed(lambda p=problem: _field(p), tables)
-            term = Term(problem.source, np.ones(m), field)
             settings = SearchSettings(gap=0.01 * _SEARCH_SHARE)
+            term = Term(problem.source, np.ones(m), field)
             found = timed(lambda t=term, s=settings: search([t], s), searched)
-            boxes += found.num_boxes
+            boxes.append(found.num_boxes)
+            cells.append(found.num_cells)
+            timed(lambda p=problem: register_point_sets(*_sets(p)), chain)
         seconds = float(np.sum(searched.cpu_s))
+        together = sum(boxes) + sum(cells)
         emit(
             "breakdown",
             {
                 "m": m,
-                "n": n,
+                "n": len(problem.target),
                 **tables.row("tables_"),
                 **searched.row("search_"),
-                "boxes_per_s": boxes / seconds,
-                "ns_per_point_and_box": 1e9 * seconds / (boxes * m),
+                **chain.row("chain_"),
+                "boxes_median": float(np.median(boxes)),
+                "swept_cells_median": float(np.median(cells)),
+                "boxes_and_cells_per_s": together / seconds,
+                "ns_per_point_and_box": 1e9 * seconds / (together * m),
+                "floor_ns_per_addition": _addition_ns(),
                 "floor_ns_per_look_up": _look_up_ns(field.num_bytes),
                 "table_mib": field.num_bytes / 2**20,
             },
         )
+
+
+def _addition_ns() -> float:
+    """What adding a row of a table in the fastest cache costs per element here, in NumPy."""
+    row, total = np.ones(2048, dtype=np.float32), np.zeros(2048, dtype=np.float32)
+    start = time.process_time()
+    for _ in range(20_000):
+        np.add(total, row, out=total)
+    return 1e9 * (time.process_time() - start) / (20_000 * len(row))
 
 
 def _look_up_ns(num_bytes: int) -> float:
