@@ -118,6 +118,19 @@ def test_a_rival_as_convincing_is_ambiguous_however_low_its_score():
     assert "another pose" in reason
 
 
+@pytest.mark.parametrize("less", [{"agreement": 0.8}, {"num_detail": 15.0}])
+def test_a_rival_that_repeats_walls_only_leaves_a_match_accepted(less):
+    """Convincing for itself, but the true pose would agree as well as its twin, and in detail."""
+    best = replace(GOOD.best, agreement=_agreement(agreement=0.99, conflict=0.0))
+    like = {"agreement": 0.99, "conflict": 0.0, **less}
+    rival = PoseEvidence(_agreement(**like), 0.4, 12.0)
+    config = GridRegistrationConfig()
+    alone = decide(replace(GOOD, best=rival), config)
+    assert alone[0] is Verdict.ACCEPTED
+    verdict, _, _ = decide(replace(GOOD, best=best, rivals=(rival,)), config)
+    assert verdict is Verdict.ACCEPTED
+
+
 def test_evidence_of_a_window_counts_its_poses():
     pair = make_pair("harbour", 0.7, "noisy", 4, size_cells=120)
     whole, _ = match_evidence(pair.source, pair.target)

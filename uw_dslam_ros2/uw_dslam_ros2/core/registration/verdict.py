@@ -61,6 +61,8 @@ class MatchEvidence:
 
 # More detail than this is no more proof: chance matches of large maps have it too.
 _ENOUGH_DETAIL = 600.0
+_LIKE_AGREEMENT = 0.1  # by how much less a rival that is the true pose may agree
+_LIKE_DETAIL = 0.1  # how much of the best pose's detail it shows at least, sharing less area
 _LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
 
 POSE_FEATURES = (
@@ -131,11 +133,19 @@ def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MO
 
 
 def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
-    """How probable the most convincing rival would be if the best pose were not there."""
+    """How probable the most convincing rival would be if the best pose were not there.
+
+    The true pose of a place that looks like itself agrees as well as its twin, for the maps are
+    the same, and in the same kind of detail. What agrees less well is repeated walls: the best
+    pose would have to agree better by chance than the true one.
+    """
+    best = evidence.best.agreement
     return max(
         (
             probability_of(replace(evidence, best=rival), models, is_alone=True)
             for rival in evidence.rivals
+            if rival.agreement.agreement >= best.agreement - _LIKE_AGREEMENT
+            and rival.agreement.num_detail >= _LIKE_DETAIL * best.num_detail
         ),
         default=0.0,
     )
