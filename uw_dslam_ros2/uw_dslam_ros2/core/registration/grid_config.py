@@ -43,4 +43,4 @@ class GridRegistrationConfig(Config):
     max_slide_share: float = setting(
         0.85, 0.1, 1.0, "score ten cells off in the weakest direction; a straight wall keeps it"
     )
-    min_probability: float = setting(0.8, 0.0, 1.0, "least probability of an accepted match")
+    min_probability: float = setting(0.75, 0.0, 1.0, "least probability of an accepted match")
