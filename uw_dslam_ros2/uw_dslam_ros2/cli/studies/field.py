@@ -135,6 +135,16 @@ def _ours(pair: MapPair, method: str) -> SE2 | None:
     return result.T_target_source if result.is_accepted else None
 
 
+def _ndt_cell_m(pair: MapPair) -> float:
+    """NDT's cells hold some wall points each, whatever the maps' resolution."""
+    return 10.0 * pair.target.spec.resolution_m
+
+
+def _ndt(pair: MapPair) -> SE2 | None:
+    found = ndt(*_points(pair), T_initial=_centred(pair), cell_m=_ndt_cell_m(pair))
+    return found.T_target_source
+
+
 def _many_start_ndt(pair: MapPair) -> SE2 | None:
     source, target = _points(pair, _NUM_MANY_START_POINTS)
     best, best_score = None, -math.inf
@@ -143,7 +153,7 @@ def _many_start_ndt(pair: MapPair) -> SE2 | None:
         turned = SE2(yaw=2.0 * math.pi * k / 36)
         moved = turned.apply(middle)
         start = SE2(float(aim[0] - moved[0]), float(aim[1] - moved[1]), turned.yaw)
-        result = ndt(source, target, T_initial=start)
+        result = ndt(source, target, T_initial=start, cell_m=_ndt_cell_m(pair))
         if result.T_target_source is not None and result.score > best_score:
             best, best_score = result.T_target_source, result.score
     return best
@@ -155,7 +165,7 @@ def _methods() -> dict[str, Method]:
         "paper (ORB, GMRBnB, NNDE)": lambda pair: _ours(pair, "paper"),
         "ICP": lambda pair: icp(*_points(pair), T_initial=_centred(pair)).T_target_source,
         "ICP, 36 starts": lambda pair: many_start_icp(*_points(pair)).T_target_source,
-        "NDT": lambda pair: ndt(*_points(pair), T_initial=_centred(pair)).T_target_source,
+        "NDT": _ndt,
         "NDT, 36 starts": _many_start_ndt,
         "ORB + RANSAC": lambda pair: orb_ransac(pair.source, pair.target).T_target_source,
     }
