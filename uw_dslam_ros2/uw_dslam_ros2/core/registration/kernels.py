@@ -693,7 +693,9 @@ def run(
                 found, counters[NUM_FOUND], box[0], box[1], box[2], box[3], box[4], box[5], arm,
                 radius,
             )  # fmt: skip
-            is_small = not is_unseen and max(box[3] * arm, max(box[4], box[5])) <= near
+            # A box of a sweep is about that small, but not yet well bounded: it is split first.
+            size = max(box[3] * arm, max(box[4], box[5]))
+            is_small = not is_unseen and size <= 0.6 * near
             if owner < 0 and is_small:
                 pose[:] = box[:3]
                 value = ascend(
