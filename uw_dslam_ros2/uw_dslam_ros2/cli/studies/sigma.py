@@ -136,6 +136,8 @@ def _draw(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
         paper = next(row["multiple"] for row in fixed if row["is_paper"])
         for axis in (top, bottom):
             axis.axvline(paper, color="black", linestyle=":", label="the paper's 0.1")
+            axis.set_xticks(_MULTIPLES, [f"{multiple:g}" for multiple in _MULTIPLES])
+            axis.set_xticks([], minor=True)
         top.set(title=str(cell).replace(", ", "\n", 1), ylim=(-0.03, 1.03))
         bottom.set(xlabel="kernel / derived kernel", ylim=(8e-4, 200.0))
     axes[0, 0].set_ylabel("share of successes")
