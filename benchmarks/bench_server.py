@@ -138,6 +138,7 @@ def cancel(quick: bool) -> None:
     with _server(**parameters) as client:
         request = _request(400)
         goal = RegisterMapsAction.Goal(source=request.source, target=request.target)
+        _, whole_s = client.ask([request], 1)
         for _ in range(3 if quick else 20):
             arrivals: list[float] = []
             sent = client.action.send_goal_async(
@@ -145,7 +146,7 @@ def cancel(quick: bool) -> None:
             )
             client.until(sent.done, "acceptance")
             done = sent.result().get_result_async()
-            begun_s, wait_s = time.monotonic(), float(rng.uniform(0.3, 2.5))
+            begun_s, wait_s = time.monotonic(), float(rng.uniform(0.1, 0.7)) * whole_s
             client.until(lambda b=begun_s, w=wait_s: time.monotonic() > b + w, "time")
             num_feedback += len(arrivals)
             watched_s += time.monotonic() - begun_s
