@@ -51,6 +51,7 @@ from uw_dslam_ros2.ros.registration_messages import (
     registration_from_msg,
 )
 from uw_dslam_ros2.ros.running import run_node
+from uw_dslam_ros2.ros.sparing import Sparing
 from uw_dslam_ros2.ros.worker import Worker
 
 __all__ = ["MapQueueManager", "MapQueueManagerConfig", "main"]
@@ -58,7 +59,6 @@ __all__ = ["MapQueueManager", "MapQueueManagerConfig", "main"]
 _SUBMAP_TYPE = "uw_dslam_msgs/msg/Submap"
 _TICK_S = 0.1
 _STATUS_PERIOD_S = 1.0
-_MAP_SHARE = 0.1  # of the time that drawing the global map may take
 _DISCOVERY_PERIOD_S = 0.5
 _SEARCH_SHARE = 0.8
 """Of the time after which a request counts as lost, what a search may take."""
@@ -82,7 +82,9 @@ class MapQueueManager(Node):
         self._asked: dict[int, MatchRequest] = {}
         self._is_changed = True
         self._is_saved = True
-        self._map_due_s = self._status_s = self._discovered_s = float("-inf")
+        # Drawing a large map takes a second: questions and answers come first.
+        self._drawing = Sparing(self._config.publish_period_s)
+        self._status_s = self._discovered_s = float("-inf")
         self._sent_transforms: tuple[Any, ...] = ()
         self._is_tick_posted = threading.Event()
         if self._config.session:
@@ -195,14 +197,11 @@ class MapQueueManager(Node):
         if not self._is_saved and self._config.session:
             save_session(self._config.session, self._queue)
             self._is_saved = True
-        if self._is_changed and now_s >= self._map_due_s:
+        if self._is_changed and self._drawing.is_due():
             self._is_changed = False
-            self._publish_map()
-            self._publish_status()
-            # Drawing a large map takes a second: questions and answers come first.
-            ended_s = time.monotonic()
-            least_s = self._config.publish_period_s
-            self._map_due_s = max(now_s + least_s, ended_s + (ended_s - now_s) / _MAP_SHARE)
+            with self._drawing.turn():
+                self._publish_map()
+                self._publish_status()
         elif now_s - self._status_s >= _STATUS_PERIOD_S:
             self._publish_status()
         self._map.publish_overdue(self._now())

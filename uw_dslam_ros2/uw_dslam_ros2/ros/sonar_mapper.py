@@ -47,6 +47,7 @@ from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_paramete
 from uw_dslam_ros2.ros.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
 from uw_dslam_ros2.ros.running import run_node
 from uw_dslam_ros2.ros.sensor_inputs import sensor_inputs
+from uw_dslam_ros2.ros.sparing import Sparing
 from uw_dslam_ros2.ros.stamp_order import StampOrder
 from uw_dslam_ros2.ros.worker import Worker
 
@@ -58,7 +59,6 @@ _MOUNT_PATIENCE_NS = 5_000_000_000
 _ODOM_PERIOD_NS = 100_000_000
 _FINISH_TIMEOUT_S = 600.0
 _IDLE_S = 4.0  # longer than the repair of a lost message takes
-_MAP_SHARE = 0.1  # of the time that drawing the growing map may take
 
 
 class SonarMapper(Node):
@@ -85,7 +85,7 @@ class SonarMapper(Node):
         self._last_problem = ""
         self._odom_stamp_ns = 0
         self._map_stamp_ns = 0
-        self._map_due_s = 0.0
+        self._drawing = Sparing(self._config.map_period_s)
         self._is_finished = False
         self._heard_s = time.monotonic()
         self._worker = Worker("mapper", self._on_worker_error)
@@ -259,7 +259,7 @@ class SonarMapper(Node):
         if isinstance(event, _PINGS):
             self._mapper_values = self._mapper.diagnostics()
             is_old = stamp_ns - self._map_stamp_ns >= self._config.map_period_s * 1e9
-            if is_old and time.monotonic() >= self._map_due_s:
+            if is_old and self._drawing.is_due():
                 self._publish_map(stamp_ns)
 
     def _finish(self) -> str:
@@ -306,17 +306,13 @@ class SonarMapper(Node):
         stamps_ns, poses = self._mapper.trajectory()
         if not len(poses):
             return
-        begun_s = time.monotonic()
         frame_id = f"{self._vehicle_id}/map"
-        occupancy = self._mapper.vehicle_map()
-        self._map_pub.publish(occupancy_to_msg(occupancy, frame_id, stamp_ns))
-        self._path_pub.publish(
-            path_to_msg(stamps_ns, poses, frame_id, stamp_ns, self._config.path_max_poses)
-        )
-        # A replay may be faster than time, and a map of hours slow to draw.
-        ended_s = time.monotonic()
-        wait_s = max(self._config.map_period_s, (ended_s - begun_s) / _MAP_SHARE)
-        self._map_due_s = ended_s + wait_s
+        with self._drawing.turn():
+            occupancy = self._mapper.vehicle_map()
+            self._map_pub.publish(occupancy_to_msg(occupancy, frame_id, stamp_ns))
+            self._path_pub.publish(
+                path_to_msg(stamps_ns, poses, frame_id, stamp_ns, self._config.path_max_poses)
+            )
 
     # --- services and diagnostics ------------------------------------------------------------
 

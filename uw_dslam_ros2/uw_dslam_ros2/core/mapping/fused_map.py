@@ -59,19 +59,10 @@ class FusedMap:
 
     def to_occupancy(self, log_odds_max: float) -> OccupancyMap:
         """The observed part in percent; at least one cell."""
-        observed = self._count > 0
-        rows, cols = np.flatnonzero(observed.any(axis=1)), np.flatnonzero(observed.any(axis=0))
-        if len(rows) == 0:
-            nothing = np.zeros((1, 1), np.int32), np.zeros((1, 1), np.bool_)
-            return SparseEvidence(*nothing, 0, 0, self._resolution_m).to_occupancy(log_odds_max)
-        window = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
-        return SparseEvidence(
-            self._evidence[window],
-            observed[window],
-            self._row + int(rows[0]),
-            self._col + int(cols[0]),
-            self._resolution_m,
-        ).to_occupancy(log_odds_max)
+        grid = SparseEvidence(
+            self._evidence, self._count > 0, self._row, self._col, self._resolution_m
+        )
+        return grid.trimmed().to_occupancy(log_odds_max)
 
     def _add(self, grid: SparseEvidence, pose: SE2, sign: int) -> None:
         resample_add(

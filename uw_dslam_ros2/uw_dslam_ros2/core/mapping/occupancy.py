@@ -47,6 +47,22 @@ class SparseEvidence:
         ]
         return np.array(cells) * self.resolution_m
 
+    def trimmed(self) -> SparseEvidence:
+        """A copy of the observed part, at least one cell."""
+        rows = np.flatnonzero(self.observed.any(axis=1))
+        cols = np.flatnonzero(self.observed.any(axis=0))
+        if len(rows) == 0:
+            nothing = np.zeros((1, 1), np.int32), np.zeros((1, 1), np.bool_)
+            return SparseEvidence(*nothing, 0, 0, self.resolution_m)
+        window = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
+        return SparseEvidence(
+            self.evidence[window].copy(),
+            self.observed[window].copy(),
+            self.row + int(rows[0]),
+            self.col + int(cols[0]),
+            self.resolution_m,
+        )
+
     def to_occupancy(self, log_odds_max: float) -> OccupancyMap:
         """Probability in percent."""
         num_rows, num_cols = self.evidence.shape
@@ -134,23 +150,9 @@ class GrowingGrid:
 
     def trimmed(self) -> SparseEvidence:
         """The observed part, at least one cell."""
-        resolution = self._config.resolution_m
-        rows, cols = (
-            np.flatnonzero(self._observed.any(axis=1)),
-            np.flatnonzero(self._observed.any(axis=0)),
-        )
-        if len(rows) == 0:
-            return SparseEvidence(
-                np.zeros((1, 1), np.int32), np.zeros((1, 1), np.bool_), 0, 0, resolution
-            )
-        window = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
-        return SparseEvidence(
-            self._evidence[window].copy(),
-            self._observed[window].copy(),
-            self._row + int(rows[0]),
-            self._col + int(cols[0]),
-            resolution,
-        )
+        resolution_m = self._config.resolution_m
+        grid = SparseEvidence(self._evidence, self._observed, self._row, self._col, resolution_m)
+        return grid.trimmed()
 
     def _grow_for(self, detections: Detections, T_frame_sonar: SE2, reach_m: float) -> None:
         config = self._config

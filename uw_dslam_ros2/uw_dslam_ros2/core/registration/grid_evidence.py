@@ -24,7 +24,7 @@ __all__ = ["Found", "Judge", "is_same_pose", "refine", "weigh"]
 FloatArray = NDArray[np.float64]
 _NUM_REFINED = 8
 _SLIDE_CELLS = 10.0
-_SAME_CELLS = 8.0  # poses nearer than that, on the finest level, are one answer
+_SAME_CELLS = 8.0  # poses nearer than that, in cells of their level, are one answer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +99,7 @@ def refine(levels: list[GridProblem], candidates: list[Candidate], limit: int) -
 
 
 def is_same_pose(problem: GridProblem, pose: FloatArray, other: FloatArray) -> bool:
-    """Whether two poses (3,) of the finest level are one answer."""
+    """Whether two poses (3,) of a level's problem are one answer."""
     offset = pose - other
     turn = abs(wrap_angle(float(offset[0]))) * problem.radius
     return turn <= _SAME_CELLS and math.hypot(offset[1], offset[2]) <= _SAME_CELLS

@@ -17,12 +17,11 @@ from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grid_search import whole_plane
 from uw_dslam_ros2.core.registration.refine_grids import WallMap
 from uw_dslam_ros2.core.registration.verdict import PoseEvidence, pose_logit
-from uw_dslam_ros2.core.se2 import SE2, wrap_angle
+from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["add_twins"]
 
 _NUM_SELF_MATCHES = 3
-_ITSELF_CELLS = 8.0  # of the searched lattice: nearer poses are the map on itself
 _MARGIN_RAD = 0.2  # past the half turn, the likeliest symmetry of all
 _LEAST_LOGIT = 0.0  # a likeness less convincing makes no rival
 _REFUTED_SHARE = 0.8  # of the match's agreement: with less, the maps themselves say no
@@ -45,9 +44,9 @@ def add_twins(
     """Evidence with the rivals that likenesses within either map make.
 
     ``sides``, ``levels`` and ``window``, beyond which nothing is a rival, as for
-    `grid_evidence.weigh`. Where a map is laid on itself by S, a
-    match T has the rival T S (or S T, on the target's side). Unless the two maps refute it, that
-    rival is as convincing as the likeness, and at most as the match.
+    `grid_evidence.weigh`. Where a map is laid on itself by S, a match T has the rival T S (or S T,
+    on the target's side). Unless the two maps refute it, that rival is as convincing as the
+    likeness, and at most as the match.
     """
     finest, evidence = levels[-1], found.evidence
     T_best = finest.to_motion(found.refined[0].pose)
@@ -117,12 +116,7 @@ def _likenesses(walls: WallMap, levels: list[GridProblem]) -> list[_Likeness]:
     )
     candidates, chance = scan_candidates(work, window)
     identity = work.to_pose(SE2())
-    others = []
-    for candidate in candidates:
-        offset = candidate.pose - identity
-        turn = abs(wrap_angle(float(offset[0]))) * work.radius
-        if turn > _ITSELF_CELLS or math.hypot(offset[1], offset[2]) > _ITSELF_CELLS:
-            others.append(candidate)
+    others = [c for c in candidates if not is_same_pose(work, c.pose, identity)]
     if not others:
         return []
     judge = Judge((walls, walls), levels, chance, 1.0)
