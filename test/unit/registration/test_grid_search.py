@@ -5,7 +5,7 @@ import pytest
 
 from uw_dslam_ros2.core.features.grid_filter import clean_cells
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.registration import grid_kernels, grid_landscape, grid_search
+from uw_dslam_ros2.core.registration import grid_kernels, grid_search
 from uw_dslam_ros2.core.registration.grid_landscape import scan_landscape
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow, build_problem
 from uw_dslam_ros2.core.registration.signed_field import (
@@ -185,17 +185,6 @@ def test_the_field_is_the_mean_of_its_definition_over_blocks(stride):
     expected = plain.reshape(side, stride, side, stride).mean(axis=(1, 3))
     found = signed_field(cells, 1.5 * stride, 0.7, stride).coefficients
     np.testing.assert_allclose(found, np.pad(expected, PAD), atol=1e-5)
-
-
-def test_points_spread_over_four_cells_keep_weight_and_place():
-    rng = np.random.default_rng(5)
-    points, weights = rng.uniform(1.0, 18.0, (200, 2)), rng.uniform(0.1, 1.0, 200)
-    image = np.zeros((20, 20), np.float32)
-    grid_landscape._splat(image, points, weights)
-    assert image.sum() == pytest.approx(weights.sum(), rel=1e-4)
-    index = np.arange(20)
-    place = [(image.sum(axis=0) * index).sum(), (image.sum(axis=1) * index).sum()]
-    np.testing.assert_allclose(place, weights @ points, rtol=1e-4)
 
 
 def test_a_stopped_search_tells_where_it_did_not_look(problem):
