@@ -197,3 +197,14 @@ def test_a_stopped_search_tells_where_it_did_not_look(problem):
     offset = np.abs(stopped.open_poses - window.middle)
     assert (offset <= window.half + 1e-9).all()
     assert len(_search(problem, window, 0.05).open_poses) == 0
+
+
+def test_many_climbs_end_where_each_alone_does(problem):
+    rng = np.random.default_rng(8)
+    starts = np.column_stack([rng.uniform(-3.0, 3.0, 20), rng.uniform(0.0, 20.0, (20, 2))])
+    poses, values = problem.ascend_all(starts)
+    for start, pose, value in zip(starts, poses, values, strict=True):
+        alone, best = problem.ascend(start)
+        np.testing.assert_array_equal(alone, pose)
+        assert best == value
+        assert value >= problem.value(start)

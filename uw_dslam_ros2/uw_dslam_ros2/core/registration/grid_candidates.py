@@ -52,12 +52,13 @@ def scan_candidates(problem: GridProblem, window: PoseWindow) -> tuple[list[Cand
 
 def climb(problem: GridProblem, poses: FloatArray) -> list[Candidate]:
     """Local maxima from poses (K, 3), best first, apart from each other."""
-    climbed = [Candidate(*problem.ascend(pose)) for pose in poses]
-    climbed.sort(key=lambda c: -c.score)
-    if not climbed:
+    if len(poses) == 0:
         return []
-    stacked = np.array([c.pose for c in climbed])
-    return [climbed[k] for k in distinct(stacked, problem.radius, 4.0, len(climbed))]
+    found, values = problem.ascend_all(poses)
+    order = np.argsort(-values, kind="stable")
+    found, values = found[order], values[order]
+    kept = distinct(found, problem.radius, 4.0, len(found))
+    return [Candidate(found[k], float(values[k])) for k in kept]
 
 
 def merge_best(

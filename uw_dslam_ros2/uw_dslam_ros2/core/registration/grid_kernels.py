@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["ascend", "bound_boxes", "objective", "objective_at"]
+__all__ = ["ascend_all", "bound_boxes", "objective", "objective_at"]
 
 FloatGrid = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -91,7 +91,7 @@ def objective(
 
 
 @njit(cache=True, nogil=True)
-def ascend(
+def _ascend(
     start: FloatArray, radius: float, max_steps: int,
     source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
     target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
@@ -154,6 +154,23 @@ def ascend(
         if has_stalled:
             break
     return pose, value
+
+
+@njit(cache=True, nogil=True)
+def ascend_all(
+    starts: FloatArray, radius: float, max_steps: int,
+    source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
+    target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
+    center: FloatArray, pad: float,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Local maxima (K, 3) that poses (K, 3) climb to, and their values."""
+    poses, values = np.empty_like(starts), np.empty(starts.shape[0])
+    for k in range(starts.shape[0]):
+        poses[k], values[k] = _ascend(
+            starts[k], radius, max_steps, source, source_weight, target_field,
+            target, target_weight, source_field, center, pad,
+        )  # fmt: skip
+    return poses, values
 
 
 @njit(cache=True, nogil=True)

@@ -75,10 +75,14 @@ class GridProblem:
 
     def ascend(self, pose: FloatArray, max_steps: int = 40) -> tuple[FloatArray, float]:
         """Local maximum that a pose (3,) climbs to, and its value."""
-        found, value = grid_kernels.ascend(
-            np.array(pose, dtype=np.float64), self.radius, max_steps, *self.arguments
-        )
-        return found, float(value)
+        found, values = self.ascend_all(np.asarray(pose)[None, :], max_steps)
+        return found[0], float(values[0])
+
+    def ascend_all(self, poses: FloatArray, max_steps: int = 40) -> tuple[FloatArray, FloatArray]:
+        """Local maxima (K, 3) that poses (K, 3) climb to, and their values (K,)."""
+        starts = np.array(poses, dtype=np.float64, order="C")
+        found, values = grid_kernels.ascend_all(starts, self.radius, max_steps, *self.arguments)
+        return found, values
 
     def to_motion(self, pose: FloatArray) -> SE2:
         """Pose (3,) in working cells to the motion between the grids' own axes [m]."""
