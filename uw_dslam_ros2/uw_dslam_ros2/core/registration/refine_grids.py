@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence
-from uw_dslam_ros2.core.registration import grid_kernels
+from uw_dslam_ros2.core.registration import agreement_kernels, grid_kernels
 from uw_dslam_ros2.core.registration.grid_lines import off_strongest_lines
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem
 from uw_dslam_ros2.core.registration.signed_field import wall_distance
@@ -52,19 +53,14 @@ class WallMap:
         is_wall = cells.wall > 0.25
         self.distance = wall_distance(cells)
         self.free = cv2.boxFilter(cells.free, -1, (3, 3), borderType=cv2.BORDER_CONSTANT)
-        self.known = cells.known > 0.5
+        known = cells.known > 0.5
+        self.num_known = int(np.count_nonzero(known))
+        # 0 unknown, 1 known, 2 known and near a wall
+        self.seen = known * (1 + (self.distance <= _NEAR_CELLS)).astype(np.uint8)
         rows, cols = np.nonzero(is_wall)
         self.points = np.column_stack([cells.col[rows, cols], cells.row[rows, cols]]).astype(
             np.float64
         )
-
-    def at(self, points: FloatArray) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-        """Known, distance [cells] and free share under points (N, 2) in cells; unknown outside."""
-        cells = np.floor(points[:, ::-1]).astype(np.int64)
-        inside = (cells >= 0).all(axis=1) & (cells < self.known.shape).all(axis=1)
-        row, col = np.where(inside[:, None], cells, 0).T
-        known = np.where(inside, self.known[row, col], False)
-        return known, self.distance[row, col].astype(np.float64), self.free[row, col]
 
 
 _NUM_LINES = 4
@@ -73,6 +69,7 @@ _LINE_HALF_WIDTH_CELLS = 2.5
 _MOST_LINE_POINTS = 1500
 _NEAR_CELLS = 2.5
 _FAR_CELLS = 3.5
+_LEAST_FREE = 0.6  # share of free cells around a wall that make it contradict the other map
 _FREE_SLIDE_SHARE = 0.85  # as good as free: the pose may be anywhere along the map
 
 
@@ -80,17 +77,19 @@ def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreeme
     """Agreement of two maps of one resolution; ``T_cells`` maps source to target cells [x, y]."""
     seen, near, conflict, square, inliers = 0, 0, 0, 0.0, 0.0
     agreeing = []
-    for walls, other, motion in ((source, target, T_cells), (target, source, T_cells.inverse())):
-        known, distance, free = other.at(motion.apply(walls.points))
-        is_near = known & (distance <= _NEAR_CELLS)
-        seen += int(known.sum())
-        near += int(is_near.sum())
-        square += float((distance[is_near] ** 2).sum())
-        conflict += int((known & (distance > _FAR_CELLS) & (free > 0.6)).sum())
+    for walls, other, T_other in ((source, target, T_cells), (target, source, T_cells.inverse())):
+        is_near = np.empty(len(walls.points), np.bool_)
+        counts = agreement_kernels.compare_walls(
+            walls.points, math.cos(T_other.yaw), math.sin(T_other.yaw), T_other.x, T_other.y,
+            other.seen, other.distance, other.free,
+            _NEAR_CELLS, _FAR_CELLS, _LEAST_FREE, is_near,
+        )  # fmt: skip
+        seen, near, conflict = seen + counts[0], near + counts[1], conflict + counts[2]
+        square += counts[3]
         points = walls.points[is_near]
         agreeing.append(T_cells.apply(points) if walls is source else points)
         if walls is source:
-            inliers = float(is_near.mean()) if len(is_near) else 0.0
+            inliers = counts[1] / max(len(is_near), 1)
     overlap, chance = _common_area(source, target, T_cells)
     return Agreement(
         overlap,
@@ -117,17 +116,13 @@ def _detail_share(points: FloatArray) -> float:
 
 def _common_area(source: WallMap, target: WallMap, T_cells: SE2) -> tuple[float, float]:
     """Area seen by both over the smaller seen area, and the share of it that is near a wall."""
-    rows, cols = target.known.shape
+    rows, cols = target.seen.shape
     matrix = T_cells.matrix()[:2].copy()
     matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts from cell centres
-    # 0 unknown, 1 known, 2 known and near a wall
-    image = source.known * (1 + (source.distance <= _NEAR_CELLS)).astype(np.uint8)
-    moved = cv2.warpAffine(image, matrix, (cols, rows), flags=cv2.INTER_NEAREST)
-    both = target.known & (moved > 0)
-    num_both = int(both.sum())
-    smaller = min(int(source.known.sum()), int(target.known.sum()))
-    near = int((both & (moved > 1)).sum()) + int((both & (target.distance <= _NEAR_CELLS)).sum())
-    return min(num_both / max(smaller, 1), 1.0), 0.5 * near / max(num_both, 1)
+    moved = cv2.warpAffine(source.seen, matrix, (cols, rows), flags=cv2.INTER_NEAREST)
+    both, near = agreement_kernels.count_common(moved, target.seen)
+    smaller = min(source.num_known, target.num_known)
+    return min(both / max(smaller, 1), 1.0), 0.5 * near / max(both, 1)
 
 
 def curvature(problem: GridProblem, pose: FloatArray) -> FloatArray:
