@@ -187,6 +187,14 @@ def test_the_field_is_the_mean_of_its_definition_over_blocks(stride):
     np.testing.assert_allclose(found, np.pad(expected, PAD), atol=1e-5)
 
 
+def test_distances_to_walls_are_exact_to_the_last_bit():
+    cells = clean_cells(_room(np.random.default_rng(6), 97))
+    walls = np.argwhere(cells.wall > 0.25)
+    index = np.stack(np.meshgrid(*2 * [np.arange(97)], indexing="ij"), axis=-1)
+    square = ((index[:, :, None, :] - walls) ** 2).sum(axis=-1).min(axis=-1)
+    np.testing.assert_array_equal(wall_distance(cells), np.sqrt(square.astype(np.float32)))
+
+
 def test_a_stopped_search_tells_where_it_did_not_look(problem):
     window = PoseWindow(np.array([0.3, 10.0, 10.0]), np.array([1.5, 8.0, 8.0]))
     stopped = grid_search.search_poses(

@@ -47,6 +47,10 @@ def wall_distance(cells: CellEvidence) -> FloatGrid:
     distance: FloatGrid = cv2.distanceTransform(
         (~is_wall).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
     )
+    # OpenCV's last bit depends on where in memory the array lies. Squares are whole numbers.
+    np.multiply(distance, distance, out=distance)
+    np.rint(distance, out=distance)
+    np.sqrt(distance, out=distance)
     return distance
 
 
