@@ -10,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration.grid_candidates import Candidate, Chance, climb, log_volume
+from uw_dslam_ros2.core.registration.grid_covariance import slide_share
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
-from uw_dslam_ros2.core.registration.refine_grids import (
-    WallMap,
-    measure_agreement,
-    slide_share,
-)
+from uw_dslam_ros2.core.registration.refine_grids import WallMap, measure_agreement
 from uw_dslam_ros2.core.registration.verdict import MatchEvidence, PoseEvidence
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 

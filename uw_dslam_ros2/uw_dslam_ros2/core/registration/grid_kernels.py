@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["ascend_all", "bound_boxes", "objective", "objective_at"]
+__all__ = ["ascend_all", "bound_boxes", "objective", "objective_at", "point_gradients"]
 
 FloatGrid = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -188,6 +188,40 @@ def objective_at(
             target, target_weight, source_field, center, pad,
         )[0]  # fmt: skip
     return values
+
+
+@njit(cache=True, nogil=True)
+def point_gradients(
+    pose: FloatArray,
+    source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
+    target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
+    center: FloatArray, pad: float,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Each point's part of the gradient of `objective` (M + N, 3), and its place (M + N, 2).
+
+    The source's points come first; places are in target cells.
+    """
+    cos, sin = math.cos(pose[0]), math.sin(pose[0])
+    count = source.shape[0]
+    gradients = np.empty((count + target.shape[0], 3))
+    places = np.empty((count + target.shape[0], 2))
+    for i in range(count):
+        px = cos * source[i, 0] - sin * source[i, 1]
+        py = sin * source[i, 0] + cos * source[i, 1]
+        x, y = px + pose[1], py + pose[2]
+        _, gx, gy = _value_gradient(target_field, x + pad, y + pad)
+        places[i, 0], places[i, 1] = x, y
+        gradients[i, 0] = source_weight[i] * (gy * px - gx * py)
+        gradients[i, 1], gradients[i, 2] = source_weight[i] * gx, source_weight[i] * gy
+    for j in range(target.shape[0]):
+        ux, uy = target[j, 0] - pose[1], target[j, 1] - pose[2]
+        qx, qy = cos * ux + sin * uy, cos * uy - sin * ux
+        _, gx, gy = _value_gradient(source_field, qx + center[0] + pad, qy + center[1] + pad)
+        places[count + j] = target[j]
+        gradients[count + j, 0] = target_weight[j] * (gx * qy - gy * qx)
+        gradients[count + j, 1] = -target_weight[j] * (cos * gx - sin * gy)
+        gradients[count + j, 2] = -target_weight[j] * (sin * gx + cos * gy)
+    return gradients, places
 
 
 @njit(cache=True, nogil=True, inline="always")

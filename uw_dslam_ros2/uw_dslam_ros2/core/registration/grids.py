@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grid_candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grid_covariance import pose_covariance
 from uw_dslam_ros2.core.registration.grid_evidence import Found, weigh
 from uw_dslam_ros2.core.registration.grid_preparation import FINE_SIGMA_CELLS, prepare_maps
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
@@ -24,7 +25,7 @@ from uw_dslam_ros2.core.registration.grid_search import (
 )
 from uw_dslam_ros2.core.registration.grid_symmetry import add_twins
 from uw_dslam_ros2.core.registration.paper_grids import register_grids_by_points
-from uw_dslam_ros2.core.registration.refine_grids import WallMap, pose_covariance
+from uw_dslam_ros2.core.registration.refine_grids import WallMap
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
     Progress,
@@ -43,7 +44,6 @@ Clock = Callable[[], float]
 _NUM_BOXES_OF_REFUSED = 20_000
 _RIVAL_SHARE = 0.5
 _LOOK_FOR_TWINS = 0.5
-_LEAST_RESIDUAL_CELLS = 0.45
 
 
 def register_grids(
@@ -289,14 +289,7 @@ class _GridMatch:
         self, problem: GridProblem, pose: FloatArray, evidence: MatchEvidence, motion: SE2
     ) -> FloatArray:
         """Covariance of ``T_target_source`` [m, m, rad] from that of the pose."""
-        agreement = evidence.best.agreement
-        # Bent maps leave larger residuals, and errors are common to whole walls; exponents and
-        # factor are those that give simulated pairs of all noises a NEES near its expectation.
-        residual_cells = max(agreement.residual_cells, _LEAST_RESIDUAL_CELLS)
-        num_pairs = math.sqrt(max(agreement.num_walls, 1)) / (1.16 * residual_cells**4.5)
-        covariance = pose_covariance(
-            problem, pose, num_pairs, FINE_SIGMA_CELLS, evidence.slide_share
-        )
+        covariance = pose_covariance(problem, pose, FINE_SIGMA_CELLS, evidence.slide_share)
         rotation = self._target.spec.T_frame_grid.rotation()
         center = self._points(problem.center[None, :], problem.resolution_m, self._source)[0]
         arm = motion.rotation() @ center

@@ -1,4 +1,4 @@
-"""What two maps say about each other at a pose, and how well they fix it."""
+"""What two maps say about each other at a pose."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence
-from uw_dslam_ros2.core.registration import agreement_kernels, grid_kernels
+from uw_dslam_ros2.core.registration import agreement_kernels
 from uw_dslam_ros2.core.registration.grid_lines import off_strongest_lines
-from uw_dslam_ros2.core.registration.grid_problem import GridProblem
 from uw_dslam_ros2.core.registration.signed_field import wall_distance
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["Agreement", "curvature", "measure_agreement", "pose_covariance", "slide_share"]
+__all__ = ["Agreement", "WallMap", "measure_agreement"]
 
 FloatArray = NDArray[np.float64]
 
@@ -70,7 +69,6 @@ _MOST_LINE_POINTS = 1500
 _NEAR_CELLS = 2.5
 _FAR_CELLS = 3.5
 _LEAST_FREE = 0.6  # share of free cells around a wall that make it contradict the other map
-_FREE_SLIDE_SHARE = 0.85  # as good as free: the pose may be anywhere along the map
 
 
 def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreement:
@@ -123,48 +121,3 @@ def _common_area(source: WallMap, target: WallMap, T_cells: SE2) -> tuple[float,
     both, near = agreement_kernels.count_common(moved, target.seen)
     smaller = min(source.num_known, target.num_known)
     return min(both / max(smaller, 1), 1.0), 0.5 * near / max(both, 1)
-
-
-def curvature(problem: GridProblem, pose: FloatArray) -> FloatArray:
-    """Negative Hessian (3, 3) of the objective, theta in cells at the rim."""
-    scale = np.array([1.0 / problem.radius, 1.0, 1.0])
-    step = 0.25
-    hessian = np.empty((3, 3))
-    for axis in range(3):
-        offset = np.zeros(3)
-        offset[axis] = step
-        ahead = np.array(grid_kernels.objective(pose + offset * scale, *problem.arguments)[1:])
-        behind = np.array(grid_kernels.objective(pose - offset * scale, *problem.arguments)[1:])
-        hessian[axis] = (ahead - behind) * scale / (2.0 * step)
-    return -0.5 * (hessian + hessian.T)
-
-
-def slide_share(problem: GridProblem, pose: FloatArray, distance_cells: float) -> float:
-    """Objective some cells away in the least curved direction, as a share of that at the pose.
-
-    Near 1 where the walls leave a direction free, as a straight wall does.
-    """
-    _, vectors = np.linalg.eigh(curvature(problem, pose))
-    step = distance_cells * vectors[:, 0] * (1.0 / problem.radius, 1.0, 1.0)
-    best = max(problem.value(pose), 1e-9)
-    return max(problem.value(pose + step), problem.value(pose - step), 0.0) / best
-
-
-def pose_covariance(
-    problem: GridProblem, pose: FloatArray, num_pairs: float, sigma_cells: float, slide: float
-) -> FloatArray:
-    """Covariance (3, 3) of [theta, t_x, t_y] in [rad, cells] from the objective's curvature.
-
-    The objective is a sum of exp(-d^2 / 2 s^2), whose curvature is that of the squared distances
-    over s^2.
-    """
-    hessian = curvature(problem, pose)
-    values, vectors = np.linalg.eigh(hessian)
-    # Directions that the maps do not fix at all get the size of the map, not infinity.
-    floor = max(float(values.max()), 1e-9) * 1e-5
-    information = np.maximum(values, floor) / max(problem.value(pose), 1e-6) * num_pairs
-    if slide > _FREE_SLIDE_SHARE:
-        information[0] = 1.0 / (sigma_cells * problem.radius) ** 2
-    inverse = vectors @ np.diag(1.0 / (information * sigma_cells**2)) @ vectors.T
-    scale = np.diag([1.0 / problem.radius, 1.0, 1.0])
-    return scale @ inverse @ scale
