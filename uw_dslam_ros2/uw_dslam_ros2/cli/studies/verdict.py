@@ -3,7 +3,9 @@
 Evidence of simulated pairs is gathered without the proof: of one place, of different places, of
 symmetric ones, of the two like ends of one basin; half of the pairs once more with a prior window
 of random size. Two small logistic models are fitted: whether a pose is right, from what speaks for
-it by itself; and whether the best pose is right, in view of its strongest rival. The models are
+it by itself, on the best poses and their rivals; and whether the best pose is right, in view of
+its strongest rival. The first model also says which pose is the best, so after it has changed the
+evidence has to be gathered once more for the second to be that of its choices. The models are
 judged on other seeds and on kinds of places that the fit never saw. The coefficients that this
 command prints are those of `uw_dslam_ros2.core.registration.verdict.MODELS`.
 """
@@ -34,6 +36,7 @@ from uw_dslam_ros2.core.registration.verdict import (
     MATCH_FEATURES,
     POSE_FEATURES,
     MatchEvidence,
+    PoseEvidence,
     VerdictModels,
     decide,
     match_features,
@@ -55,20 +58,31 @@ _RIDGE = 1.0
 # How rare a basin is whose other end looks the same, against the other places: nothing in the maps
 # of its ends can tell them apart where piers and corners are the same.
 _BASIN_WEIGHT = 0.3
+_RIVAL_WEIGHT = 0.3  # of poses beside the best: there are several in each pair
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trial:
     spec: PairSpec
     has_prior: bool
-    is_right: bool
     evidence: MatchEvidence
+    poses: tuple[tuple[PoseEvidence, bool], ...]  # the best one first, and whether it is right
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the best pose is."""
+        return self.poses[0][1]
+
+    @property
+    def weight(self) -> float:
+        """In a fit."""
+        return _BASIN_WEIGHT if self.spec.kind == "basin" else 1.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this study."""
-    parser.add_argument("--seeds", type=int, default=2, help="seeds of the fit (%(default)s)")
-    parser.add_argument("--checks", type=int, default=1, help="seeds held out (%(default)s)")
+    parser.add_argument("--seeds", type=int, default=4, help="seeds of the fit (%(default)s)")
+    parser.add_argument("--checks", type=int, default=2, help="seeds held out (%(default)s)")
     parser.add_argument("--fit-kinds", nargs="+", default=list(_FIT_KINDS), help="places fitted")
     parser.add_argument(
         "--check-kinds", nargs="+", default=list(_CHECK_KINDS), help="places judged on"
@@ -128,8 +142,9 @@ def _gathered(path: Path, specs: Iterable[PairSpec]) -> list[_Trial]:
                 found = match_evidence(pair.source, pair.target, prior=prior)
                 if found is None:
                     continue
-                evidence, motion = found
-                trials.append(_Trial(spec, has_prior, is_right(pair, motion), evidence))
+                evidence, weighed = found
+                poses = tuple((pose, is_right(pair, motion)) for pose, motion in weighed)
+                trials.append(_Trial(spec, has_prior, evidence, poses))
                 features = pose_features(evidence.best, evidence.log_volume)
                 writer.writerow(
                     (*asdict(spec).values(), has_prior, trials[-1].is_right, *features,
@@ -144,23 +159,34 @@ def _fitted(trials: list[_Trial]) -> VerdictModels:
     A pose in a symmetric place is convincing for itself wherever it is: there, rivals decide. The
     second model is of the matches that no convincing rival makes ambiguous anyway.
     """
-    plain = [t for t in trials if t.spec.kind != "symmetric"]
-    features = [pose_features(t.evidence.best, t.evidence.log_volume) for t in plain]
-    pose = _logistic(features, plain)
+    features, is_right, weights = [], [], []
+    for trial in trials:
+        if trial.spec.kind == "symmetric":
+            continue
+        for number, (one, is_pose_right) in enumerate(trial.poses):
+            features.append(pose_features(one, trial.evidence.log_volume))
+            is_right.append(is_pose_right)
+            weights.append(trial.weight * (_RIVAL_WEIGHT if number else 1.0))
+    pose = _logistic(features, is_right, weights)
     alone = VerdictModels(pose, (0.0, 1.0, 0.0))
     limit = GridRegistrationConfig().max_rival_probability
     left = [t for t in trials if rival_probability(t.evidence, alone) <= limit]
-    return VerdictModels(pose, _logistic([match_features(t.evidence, pose) for t in left], left))
+    match = _logistic(
+        [match_features(t.evidence, pose) for t in left],
+        [t.is_right for t in left],
+        [t.weight for t in left],
+    )
+    return VerdictModels(pose, match)
 
 
-def _logistic(rows: list[tuple[float, ...]], trials: list[_Trial]) -> tuple[float, ...]:
+def _logistic(
+    rows: list[tuple[float, ...]], is_right: list[bool], weights: list[float]
+) -> tuple[float, ...]:
     """Coefficients, intercept first, of a ridge-regularised logistic model."""
     features = np.array(rows)
-    is_right = np.array([t.is_right for t in trials])
-    weight = np.array([_BASIN_WEIGHT if t.spec.kind == "basin" else 1.0 for t in trials])
     mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-9
     model = LogisticRegression(C=1.0 / _RIDGE, max_iter=5000)
-    model.fit((features - mean) / spread, is_right, sample_weight=weight)
+    model.fit((features - mean) / spread, is_right, sample_weight=weights)
     slopes = model.coef_[0] / spread
     intercept = float(model.intercept_[0] - slopes @ mean)
     return tuple(round(value, 4) for value in (intercept, *map(float, slopes)))

@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.se2 import wrap_angle
 __all__ = ["Candidate", "Chance", "climb", "log_volume", "merge_best", "scan_candidates"]
 
 FloatArray = NDArray[np.float64]
-_NUM_CANDIDATES = 24
+_NUM_CANDIDATES = 40
 _OWN_PEAK_CELLS = 6.0
 
 

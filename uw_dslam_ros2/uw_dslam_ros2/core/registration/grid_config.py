@@ -29,14 +29,11 @@ class GridRegistrationConfig(Config):
     max_boxes: int = setting(200_000, 1000, 1_000_000_000, "boxes before the proof is given up")
     max_seconds: float = setting(20.0, 0.1, 3600.0, "time for the proof [s]; needs a clock")
     is_proof_required: bool = setting(
-        False, doc="refuse a match, however probable, whose proof stayed wider than the gap"
+        False, doc="refuse a match, however probable, that is not the proven optimum to the gap"
     )
     min_wall_cells: int = setting(25, 1, 100000, "fewer wall cells in a map are too few")
     min_overlap: float = setting(0.1, 0.0, 1.0, "least common seen area, share of the smaller")
     max_conflict: float = setting(0.4, 0.0, 1.0, "walls on free space, share of common walls")
-    max_rival_share: float = setting(
-        0.9, 0.1, 1.0, "a rival's score from which on it is ambiguous"
-    )
     max_rival_probability: float = setting(
         0.8, 0.0, 1.0, "a rival that by itself is more probable than that makes it ambiguous"
     )

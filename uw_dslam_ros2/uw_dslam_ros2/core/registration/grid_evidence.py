@@ -13,13 +13,13 @@ from uw_dslam_ros2.core.registration.grid_candidates import Candidate, Chance, c
 from uw_dslam_ros2.core.registration.grid_covariance import slide_share
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.refine_grids import WallMap, measure_agreement
-from uw_dslam_ros2.core.registration.verdict import MatchEvidence, PoseEvidence
+from uw_dslam_ros2.core.registration.verdict import MatchEvidence, PoseEvidence, pose_logit
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 __all__ = ["Found", "Judge", "is_same_pose", "refine", "weigh"]
 
 FloatArray = NDArray[np.float64]
-_NUM_REFINED = 8
+_NUM_REFINED = 12
 _SLIDE_CELLS = 10.0
 _SAME_CELLS = 8.0  # poses nearer than that, in cells of their level, are one answer
 
@@ -38,13 +38,12 @@ class Judge:
     """What two maps say about one pose after the other.
 
     ``levels`` are problems from the searched lattice to the finest one; ``sides`` are source and
-    target on the finest; ``best_score`` is what shares of scores are of.
+    target on the finest.
     """
 
     sides: tuple[WallMap, WallMap]
     levels: list[GridProblem]
     chance: Chance
-    best_score: float
 
     def evidence(self, candidate: Candidate) -> PoseEvidence:
         """Evidence for a pose of the finest level."""
@@ -52,9 +51,8 @@ class Judge:
         T_grids = finest.to_motion(candidate.pose)
         scale = 1.0 / finest.resolution_m
         T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
-        share = candidate.score / self.best_score if self.best_score > 0.0 else 1.0
         surprise = self.chance.surprise(work.value(work.to_pose(T_grids)))
-        return PoseEvidence(measure_agreement(*self.sides, T_cells), share, surprise)
+        return PoseEvidence(measure_agreement(*self.sides, T_cells), candidate.score, surprise)
 
 
 def weigh(
@@ -68,19 +66,22 @@ def weigh(
 
     ``sides`` and ``levels`` as for `Judge`.
     """
-    finest = levels[-1]
-    refined = refine(levels, candidates, _NUM_REFINED)
-    best = refined[0]
-    refined = [best, *(c for c in refined[1:] if not is_same_pose(finest, c.pose, best.pose))]
-    judge = Judge(sides, levels, chance, best.score)
-    poses = [judge.evidence(candidate) for candidate in refined]
+    finest, volume = levels[-1], log_volume(levels[0], window)
+    judge = Judge(sides, levels, chance)
+    weighed = [(c, judge.evidence(c)) for c in refine(levels, candidates, _NUM_REFINED)]
+    # The objective counts what overlaps, so a pose that lays much on much may score above the true
+    # one though the maps contradict it: evidence decides.
+    weighed.sort(key=lambda pair: -pose_logit(pair[1], volume))
+    best, _ = weighed[0]
+    apart = [p for p in weighed[1:] if not is_same_pose(finest, p[0].pose, best.pose)]
+    refined, poses = zip(weighed[0], *apart, strict=True)
     evidence = MatchEvidence(
         best=poses[0],
-        rivals=tuple(poses[1:]),
+        rivals=poses[1:],
         slide_share=slide_share(finest, best.pose, _SLIDE_CELLS),
-        log_volume=log_volume(levels[0], window),
+        log_volume=volume,
     )
-    return Found(refined, evidence, chance)
+    return Found(list(refined), evidence, chance)
 
 
 def refine(levels: list[GridProblem], candidates: list[Candidate], limit: int) -> list[Candidate]:

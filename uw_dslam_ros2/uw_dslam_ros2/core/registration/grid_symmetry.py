@@ -57,7 +57,7 @@ def add_twins(
                 twins.append((T_best @ T_self if is_source else T_self @ T_best, likeness))
     if not twins:
         return found
-    judge = Judge(sides, levels, found.chance, found.refined[0].score)
+    judge = Judge(sides, levels, found.chance)
 
     def logit(pose: PoseEvidence) -> float:
         return pose_logit(pose, evidence.log_volume)
@@ -73,7 +73,7 @@ def add_twins(
         seen = judge.evidence(candidate)
         if seen.agreement.agreement >= _REFUTED_SHARE * evidence.best.agreement.agreement:
             weaker = min(likeness.evidence, evidence.best, key=logit)
-            seen = max(seen, replace(weaker, share=seen.share), key=logit)
+            seen = max(seen, replace(weaker, score=seen.score), key=logit)
         if same:
             rivals[same[0] - 1] = seen
         else:
@@ -119,7 +119,7 @@ def _likenesses(walls: WallMap, levels: list[GridProblem]) -> list[_Likeness]:
     others = [c for c in candidates if not is_same_pose(work, c.pose, identity)]
     if not others:
         return []
-    judge = Judge((walls, walls), levels, chance, 1.0)
+    judge = Judge((walls, walls), levels, chance)
     found = []
     for candidate in refine(levels, others, _NUM_SELF_MATCHES):
         likeness = _Likeness(finest.to_motion(candidate.pose), judge.evidence(candidate))

@@ -33,7 +33,12 @@ from uw_dslam_ros2.core.registration.result import (
     Rival,
     Verdict,
 )
-from uw_dslam_ros2.core.registration.verdict import MatchEvidence, decide, probability_of
+from uw_dslam_ros2.core.registration.verdict import (
+    MatchEvidence,
+    PoseEvidence,
+    decide,
+    probability_of,
+)
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["GridRegistrationConfig", "match_evidence", "register_grids"]
@@ -44,6 +49,7 @@ Clock = Callable[[], float]
 _NUM_BOXES_OF_REFUSED = 20_000
 _RIVAL_SHARE = 0.5
 _LOOK_FOR_TWINS = 0.5
+_SAME_SCORE = 1e-6
 
 
 def register_grids(
@@ -100,10 +106,11 @@ def match_evidence(
     config: GridRegistrationConfig | None = None,
     *,
     prior: PriorWindow | None = None,
-) -> tuple[MatchEvidence, SE2] | None:
-    """What `register_grids` would judge by, and its best pose, without the proof; for studies.
+) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
+    """What `register_grids` would judge by, without the proof; for studies.
 
-    None where a map holds too little to be matched.
+    The list holds the evidence of each pose by itself, the best one first, and its
+    ``T_target_source``. None where a map holds too little to be matched.
     """
     maps = shrink_blocks(source), shrink_blocks(target)
     match = _GridMatch(*maps, config or GridRegistrationConfig(), prior, None)
@@ -167,16 +174,18 @@ class _GridMatch:
             found = weigh(walls, levels, window, candidates, chance)
         return self._answer(levels, outcome, _with_twins(found, walls, levels, window))
 
-    def collect(self) -> tuple[MatchEvidence, SE2] | None:
-        """Evidence for the best pose, and the pose; None where a map holds too little."""
+    def collect(self) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
+        """Evidence, and that of each pose by itself; None where a map holds too little."""
         prepared = prepare_maps(self._source, self._target, self._config)
         if isinstance(prepared, str):
             return None
         levels, walls = prepared
         window = self._window(levels[0])
         found = weigh(walls, levels, window, *scan_candidates(levels[0], window))
-        found = _with_twins(found, walls, levels, window)
-        return found.evidence, self._to_frame(levels[-1].to_motion(found.refined[0].pose))
+        weighed = (found.evidence.best, *found.evidence.rivals)
+        motions = [self._to_frame(levels[-1].to_motion(c.pose)) for c in found.refined]
+        evidence = _with_twins(found, walls, levels, window).evidence
+        return evidence, list(zip(weighed, motions, strict=True))
 
     def _window(self, problem: GridProblem) -> PoseWindow:
         """Poses that a prior allows, or all."""
@@ -241,6 +250,16 @@ class _GridMatch:
         work, finest = levels[0], levels[-1]
         pose, agreement = found.refined[0].pose, found.evidence.best.agreement
         verdict, reason, probability = decide(found.evidence, self._config)
+        at_work = work.to_pose(finest.to_motion(pose))
+        score, (_, summit) = work.value(at_work), work.ascend(at_work)
+        is_optimum = summit >= (1.0 - self._config.gap) * outcome.lower_bound - _SAME_SCORE
+        if not is_optimum:
+            reason = (
+                f"{reason}; another pose has a higher score, {outcome.lower_bound:.3f} against "
+                f"{score:.3f}, but the maps speak for this one"
+            )
+            if self._config.is_proof_required and verdict is Verdict.ACCEPTED:
+                verdict = Verdict.AMBIGUOUS
         if verdict is Verdict.ACCEPTED and not outcome.is_complete:
             # Evidence decides what is right; the proof, how much better another pose could score.
             open_gap = (
@@ -256,11 +275,12 @@ class _GridMatch:
             verdict = Verdict.BUDGET_EXHAUSTED
             reason = f"cancelled after {outcome.num_boxes} boxes, before the proof was complete"
         motion = self._to_frame(finest.to_motion(pose))
-        bound = outcome.upper_bound / max(outcome.lower_bound, 1e-12)
+        bound = outcome.upper_bound / max(score, 1e-12)
+        best_score = max(found.evidence.best.score, 1e-9)
         rivals = tuple(
-            Rival(self._to_frame(finest.to_motion(c.pose)), rival.share, bound)
+            Rival(self._to_frame(finest.to_motion(c.pose)), rival.score / best_score, bound)
             for c, rival in zip(found.refined[1:], found.evidence.rivals, strict=True)
-            if rival.share > _RIVAL_SHARE or verdict is Verdict.AMBIGUOUS
+            if rival.score > _RIVAL_SHARE * best_score or verdict is Verdict.AMBIGUOUS
         )
         source_points = work.source_points + work.center
         return RegistrationResult(
@@ -269,10 +289,10 @@ class _GridMatch:
             T_target_source=motion,
             covariance=self._covariance(finest, pose, found.evidence, motion),
             probability=probability,
-            score=outcome.lower_bound,
+            score=score,
             lower_bound=outcome.lower_bound,
             upper_bound=outcome.upper_bound,
-            is_certified=outcome.is_complete,
+            is_certified=outcome.is_complete and is_optimum,
             num_boxes=outcome.num_boxes,
             seconds=self._elapsed(),
             overlap=agreement.overlap,

@@ -69,7 +69,8 @@ class RegistrationResult:
 
     ``T_target_source`` is the best guess even where the verdict refuses it, for logs and
     pictures: callers must look at `is_accepted`. Scores and bounds are in one unit, 1 being a
-    perfect match of all source weight.
+    perfect match of all source weight; ``score`` is of ``T_target_source``, the bounds are of the
+    objective's maximum, which may be another pose where evidence speaks against that.
     """
 
     verdict: Verdict

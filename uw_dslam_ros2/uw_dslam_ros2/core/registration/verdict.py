@@ -30,18 +30,18 @@ __all__ = [
 class PoseEvidence:
     """What is known about one pose of two maps.
 
-    ``share`` is its score over the best pose's, ``surprise`` how far the score lies above what
-    chance alignments of these two maps reach, in standard deviations of such.
+    ``score`` is the objective on the finest level, ``surprise`` how far that on the searched level
+    lies above what chance alignments of these two maps reach, in standard deviations of such.
     """
 
     agreement: Agreement
-    share: float
+    score: float
     surprise: float
 
 
 @dataclass(frozen=True, slots=True)
 class MatchEvidence:
-    """What is known about the best pose of two maps, and about its rivals.
+    """What is known about the best pose of two maps, the most convincing one, and its rivals.
 
     ``slide_share`` is the score some cells off in the least curved direction over the best one.
     ``log_volume`` is the logarithm of the number of poses that were searched: the more there are,
@@ -55,14 +55,19 @@ class MatchEvidence:
 
     @property
     def rival_share(self) -> float:
-        """Score of the best rival over the best pose's."""
-        return max((rival.share for rival in self.rivals), default=0.0)
+        """Greatest score of a rival over the best pose's."""
+        most = max((rival.score for rival in self.rivals), default=0.0)
+        return max(most, 0.0) / max(self.best.score, 1e-9)
 
 
 # More detail than this is no more proof: chance matches of large maps have it too.
 _ENOUGH_DETAIL = 600.0
-_LIKE_AGREEMENT = 0.1  # by how much less a rival that is the true pose may agree
-_LIKE_DETAIL = 0.1  # how much of the best pose's detail it shows at least, sharing less area
+_LIKE_DEVIATIONS = 2.0  # by how many standard errors a rival that is the true pose may agree less
+# Wall cells next to each other agree or not together: so many count as one (design effect, the
+# scatter of sums over squares against that of independent cells: 2.5 to 6 in noisy maps).
+_CELLS_PER_SAMPLE = 5.0
+_LEAST_VARIANCE = 0.005  # of one sample, as if one in two hundred disagreed
+_LIKE_DETAIL = 0.02  # how much of the best pose's detail it shows at least, sharing less area
 _LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
 
 POSE_FEATURES = (
@@ -86,8 +91,8 @@ class VerdictModels:
 
 
 MODELS = VerdictModels(
-    pose=(-2.2827, 5.9823, -11.9677, 0.6946, -6.502, 0.6251, -0.1962),
-    match=(0.0506, 0.8459, -0.6334),
+    pose=(1.054, 5.587, -18.406, 0.86, -6.849, 0.968, -0.429),
+    match=(0.324, 0.887, -1.431),
 )
 """Fitted by `study verdict` with its default settings, which prints them."""
 
@@ -109,9 +114,25 @@ def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tupl
     """Logit of the best pose for itself, and how convincing its strongest rival is, from 0 up."""
     best, *rivals = (
         _logit(pose_model, pose_features(pose, evidence.log_volume))
-        for pose in (evidence.best, *evidence.rivals)
+        for pose in (evidence.best, *_serious_rivals(evidence))
     )
     return best, math.log1p(math.exp(max(rivals))) if rivals else 0.0
+
+
+def _serious_rivals(evidence: MatchEvidence) -> list[PoseEvidence]:
+    """Rivals that may be the true pose of a place that looks like itself.
+
+    The true pose agrees as well as its twin, for the maps are the same, and in the same kind of
+    detail. What agrees significantly less is repeated walls: the best pose would have to agree
+    better by chance than the true one.
+    """
+    best = evidence.best.agreement
+    return [
+        rival
+        for rival in evidence.rivals
+        if _lead(best, rival.agreement) < _LIKE_DEVIATIONS
+        and rival.agreement.num_detail >= _LIKE_DETAIL * best.num_detail
+    ]
 
 
 def probability_of(
@@ -133,22 +154,23 @@ def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MO
 
 
 def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
-    """How probable the most convincing rival would be if the best pose were not there.
-
-    The true pose of a place that looks like itself agrees as well as its twin, for the maps are
-    the same, and in the same kind of detail. What agrees less well is repeated walls: the best
-    pose would have to agree better by chance than the true one.
-    """
-    best = evidence.best.agreement
+    """How probable the most convincing serious rival would be if the best pose were not there."""
     return max(
         (
             probability_of(replace(evidence, best=rival), models, is_alone=True)
-            for rival in evidence.rivals
-            if rival.agreement.agreement >= best.agreement - _LIKE_AGREEMENT
-            and rival.agreement.num_detail >= _LIKE_DETAIL * best.num_detail
+            for rival in _serious_rivals(evidence)
         ),
         default=0.0,
     )
+
+
+def _lead(best: Agreement, rival: Agreement) -> float:
+    """By how many standard errors one pose agrees better than another."""
+    variance = 0.0
+    for pose in (best, rival):
+        one = max(pose.agreement * (1.0 - pose.agreement), _LEAST_VARIANCE)
+        variance += one / max(pose.num_walls / _CELLS_PER_SAMPLE, 1.0)
+    return (best.agreement - rival.agreement) / math.sqrt(variance)
 
 
 def _logit(model: Sequence[float], features: Sequence[float]) -> float:
@@ -185,11 +207,7 @@ def decide(
     # Rivals only matter to an alignment that would be convincing without them.
     alone = probability_of(evidence, models, is_alone=True)
     rival = rival_probability(evidence, models)
-    is_rivalled = (
-        evidence.rival_share > config.max_rival_share
-        or rival > config.max_rival_probability
-        or not is_probable
-    )
+    is_rivalled = rival > config.max_rival_probability or not is_probable
     if is_rivalled and alone >= config.min_probability:
         reason = (
             f"another pose agrees as well where it overlaps: it would be right with probability "
