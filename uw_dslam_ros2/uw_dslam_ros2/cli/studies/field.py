@@ -1,4 +1,4 @@
-"""The paper's Figures 8 and 9: two maps merged by ours, ICP, NDT and ORB + RANSAC.
+"""The paper's Figures 8 and 9: two maps merged by ours, the paper's, ICP, NDT, ORB + RANSAC.
 
 All methods see the same pairs. MSE and SSIM compare the merged map with the one merged by the true
 motion; success stands beside them, because a method that refuses leaves one map alone and gets a
@@ -125,14 +125,19 @@ def _centred(pair: MapPair) -> SE2:
     return SE2(float(target[0] - source[0]), float(target[1] - source[1]), 0.0)
 
 
-def _ours(pair: MapPair, method: str) -> SE2 | None:
-    config = GridRegistrationConfig()
-    if method == "paper":
-        config = GridRegistrationConfig(
-            method=method, max_points=_NUM_PAPER_POINTS, max_boxes=_NUM_PAPER_BOXES
-        )
+def _accepted(pair: MapPair, config: GridRegistrationConfig) -> SE2 | None:
     result = register_grids(pair.source, pair.target, config)
     return result.T_target_source if result.is_accepted else None
+
+
+def _paper(pair: MapPair, features: str) -> SE2 | None:
+    config = GridRegistrationConfig(
+        method="paper",
+        features=features,
+        max_points=_NUM_PAPER_POINTS,
+        max_boxes=_NUM_PAPER_BOXES,
+    )
+    return _accepted(pair, config)
 
 
 def _ndt_cell_m(pair: MapPair) -> float:
@@ -161,8 +166,10 @@ def _many_start_ndt(pair: MapPair) -> SE2 | None:
 
 def _methods() -> dict[str, Method]:
     return {
-        "ours": lambda pair: _ours(pair, "signed"),
-        "paper (ORB, GMRBnB, NNDE)": lambda pair: _ours(pair, "paper"),
+        "ours": lambda pair: _accepted(pair, GridRegistrationConfig()),
+        "paper (ORB, GMRBnB, NNDE)": lambda pair: _paper(pair, "orb"),
+        "paper, on wall points": lambda pair: _paper(pair, "walls"),
+        "paper, on both": lambda pair: _paper(pair, "both"),
         "ICP": lambda pair: icp(*_points(pair), T_initial=_centred(pair)).T_target_source,
         "ICP, 36 starts": lambda pair: many_start_icp(*_points(pair)).T_target_source,
         "NDT": _ndt,
@@ -214,7 +221,7 @@ def _scored(spec: PairSpec, pair: MapPair, name: str, motion: SE2 | None) -> Row
 def _draw(path: Path, pair: MapPair, motions: dict[str, SE2 | None]) -> None:
     """Each method's merged map, as the paper's Figure 8."""
     shown = {"truth": pair.T_target_source, **motions}
-    picture, grid = figure(2, 4, width=11.0, height=6.0)
+    picture, grid = figure(2, 5, width=13.0, height=6.0)
     lattice = _lattice(pair)
     corners = []  # of all outlines, so that all pictures show the same part of the lattice
     for axes, (name, motion) in zip(grid.ravel(), shown.items(), strict=False):
