@@ -4,6 +4,7 @@ import csv
 import os
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from uw_dslam_ros2.cli.studies import field, sigma, verdict
@@ -11,6 +12,11 @@ from uw_dslam_ros2.cli.studies._ceiling import best_with_known_noise
 from uw_dslam_ros2.cli.studies._common import is_success
 from uw_dslam_ros2.cli.studies._trials import Cell
 from uw_dslam_ros2.cli.study import build_parser, main, study_names
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.sim.floor_plans import make_place
+from uw_dslam_ros2.sim.map_pairs import observe
 
 
 def test_every_study_has_help(capsys):
@@ -172,6 +178,34 @@ def test_field_scores_all_methods_on_the_same_pairs(tmp_path, capsys, monkeypatc
             assert all(float(row["mse"]) < float(r["mse"]) for r in wrong)
     assert (tmp_path / "harbour_70.png").exists()
     assert "ORB + RANSAC" in capsys.readouterr().out
+
+
+def _written_place(folder, name, seed):
+    rng = np.random.default_rng(seed)
+    values = observe(make_place("office", 700, rng), rng)
+    write_map(folder / name, OccupancyMap(GridSpec(0.05, *values.shape, SE2()), values))
+    return folder / f"{name}.yaml"
+
+
+def test_windows_of_given_maps_are_registered(tmp_path, capsys):
+    maps = [str(_written_place(tmp_path, f"floor_{k}", k)) for k in range(2)]
+    arguments = ["--maps", *maps, "--overlaps", "0.7", "--noises", "clean", "--size", "10"]
+    assert main(["windows", "--out", str(tmp_path), *arguments]) == 0
+    rows = _rows(tmp_path / "windows.csv")
+    matching = [row for row in rows if row["matching"] == "True"]
+    assert [row["map"] for row in matching] == ["floor_0", "floor_1"]
+    assert all(row["right"] == "True" for row in matching)
+    others = [row for row in rows if row["matching"] == "False"]
+    assert len(others) == 4  # elsewhere on the same map, and on the other one
+    assert not any(row["accepted"] == "True" for row in others)
+    assert "maps of different places: 0 of 4 accepted" in capsys.readouterr().out
+
+
+def test_windows_says_which_map_is_too_small(tmp_path, capsys):
+    path = _written_place(tmp_path, "floor", 0)
+    arguments = ["--maps", str(path), "--size", "60"]
+    assert main(["windows", "--out", str(tmp_path), *arguments]) == 1
+    assert "map floor: no two windows of 1200 cells" in capsys.readouterr().err
 
 
 def test_outliers_refuses_a_cell_that_is_not_there(tmp_path, capsys):

@@ -19,7 +19,17 @@ from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, Occupancy
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.floor_plans import BASIN_MARGIN, make_place
 
-__all__ = ["NOISES", "MapNoise", "MapPair", "cut_pair", "damage", "make_pair", "observe"]
+__all__ = [
+    "NOISES",
+    "MapNoise",
+    "MapPair",
+    "cut_pair",
+    "cut_window",
+    "damage",
+    "make_pair",
+    "observe",
+    "windows_about",
+]
 
 Values = NDArray[np.int8]
 _BEND_CELLS = 300
@@ -156,7 +166,7 @@ def _bend(values: Values, bend_cells: float, rng: np.random.Generator) -> Values
     return bent.astype(np.int8)
 
 
-def _cut(values: Values, T_world_window: SE2, size_cells: int) -> Values:
+def cut_window(values: Values, T_world_window: SE2, size_cells: int) -> Values:
     """Window of a world's values; poses in cells, nearest cell, unknown outside."""
     rows, cols = np.indices((size_cells, size_cells))
     centers = np.column_stack([cols.ravel() + 0.5, rows.ravel() + 0.5])
@@ -183,17 +193,36 @@ def _place_windows(
         yaw_a, yaw_b, heading = rng.uniform(-math.pi, math.pi, 3)
         margin = half * 1.1
         center = rng.uniform(margin, world_cells - margin, 2)
-        low, high = 0.0, 2.0 * size_cells
-        for _ in range(40):  # bisection: the overlap falls with the distance
-            distance = (low + high) / 2.0
-            other = center + distance * np.array([math.cos(heading), math.sin(heading)])
-            T_a, T_b = _window_at(center, yaw_a, half), _window_at(other, yaw_b, half)
-            if _window_overlap(T_a.inverse() @ T_b, size_cells) > overlap:
-                low = distance
-            else:
-                high = distance
+        T_a, T_b = windows_about(center, (yaw_a, yaw_b), heading, size_cells, overlap)
+        other = T_b.apply(np.array([[half, half]]))[0]
         if (other > margin).all() and (other < world_cells - margin).all():
             break
+    return T_a, T_b
+
+
+def windows_about(
+    center: NDArray[np.float64],
+    yaws: tuple[float, float],
+    heading: float,
+    size_cells: int,
+    overlap: float,
+) -> tuple[SE2, SE2]:
+    """Poses of a window about a place and of one in a direction that it overlaps by a share.
+
+    In cells of the map that they are cut from.
+    """
+    half = size_cells / 2.0
+    yaw_a, yaw_b = yaws
+    T_a = _window_at(center, yaw_a, half)
+    low, high = 0.0, 2.0 * size_cells
+    for _ in range(40):  # bisection: the overlap falls with the distance
+        distance = (low + high) / 2.0
+        other = center + distance * np.array([math.cos(heading), math.sin(heading)])
+        T_b = _window_at(other, yaw_b, half)
+        if _window_overlap(T_a.inverse() @ T_b, size_cells) > overlap:
+            low = distance
+        else:
+            high = distance
     return T_a, T_b
 
 
@@ -224,7 +253,7 @@ def cut_pair(
     )
     maps, specs = [], []
     for values, T_world_window in ((values_a, T_world_a), (values_b, T_world_b)):
-        window = damage(_cut(values, T_world_window, size_cells), NOISES[noise], rng)
+        window = damage(cut_window(values, T_world_window, size_cells), NOISES[noise], rng)
         spec = GridSpec(
             resolution_m,
             size_cells,

@@ -3,16 +3,30 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from uw_dslam_ros2.core.registration.result import PriorWindow
-from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.cli.studies._common import share_interval
+from uw_dslam_ros2.core.registration.grids import register_grids
+from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
+from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
 
-__all__ = ["PairSpec", "is_right", "pair_errors", "pair_specs", "random_prior"]
+__all__ = [
+    "SHARES",
+    "PairSpec",
+    "accepted_of_different",
+    "is_right",
+    "pair_errors",
+    "pair_specs",
+    "random_prior",
+    "registered",
+    "shares",
+]
 
 RIGHT_CELLS = 6.0
 RIGHT_RAD = math.radians(2.0)
@@ -98,3 +112,65 @@ def is_right(pair: MapPair, T_target_source: SE2) -> bool:
     """Within 2 degrees and six cells, 0.30 m at 0.05 m."""
     error_m, error_rad = pair_errors(pair, T_target_source)
     return error_rad < RIGHT_RAD and error_m < RIGHT_CELLS * pair.source.spec.resolution_m
+
+
+def registered(pair: MapPair) -> dict[str, Any]:
+    """What `register_grids` says of a pair, and how right that is; for a CSV file."""
+    result = register_grids(pair.source, pair.target, clock=time.monotonic)
+    error_m, error_rad = pair_errors(pair, result.T_target_source)
+    return {
+        "matching": pair.T_target_source is not None,
+        "right": is_right(pair, result.T_target_source),
+        "accepted": result.is_accepted,
+        "verdict": result.verdict.name,
+        "certified": result.is_certified,
+        "probability": result.probability,
+        "error_cells": error_m / pair.source.spec.resolution_m,
+        "error_deg": math.degrees(error_rad),
+        "nees": _nees(pair, result),
+        "gap": result.gap,
+        "boxes": result.num_boxes,
+        "seconds": result.seconds,
+    }
+
+
+def _nees(pair: MapPair, result: RegistrationResult) -> float:
+    """Squared error over the stated covariance; 3 on average where that is true."""
+    if pair.T_target_source is None:
+        return math.nan
+    error = result.T_target_source.as_array() - pair.T_target_source.as_array()
+    error[2] = wrap_angle(error[2])
+    return float(error @ np.linalg.solve(result.covariance, error))
+
+
+SHARES = (
+    "right", "accepted, right", "accepted, wrong", "certified", "median cells", "median deg",
+    "NEES",
+)  # fmt: skip
+"""Titles of the columns that `shares` gives."""
+
+
+def shares(rows: list[dict[str, Any]]) -> tuple[str, ...]:
+    """What became of rows of `registered` of matching pairs, as text for a table."""
+    right = np.mean([r["right"] for r in rows])
+    kept = [r for r in rows if r["right"] and r["accepted"]]
+    wrong = np.mean([r["accepted"] and not r["right"] for r in rows])
+    answer = [f"{right:.2f}", f"{len(kept) / len(rows):.2f}", f"{wrong:.3f}"]
+    answer.append(f"{np.mean([r['certified'] for r in rows if r['accepted']] or [0]):.2f}")
+    for name in ("error_cells", "error_deg"):
+        answer.append(f"{np.median([r[name] for r in kept]):.2f}" if kept else "-")
+    answer.append(f"{np.mean([r['nees'] for r in kept]):.1f}" if kept else "-")
+    return tuple(answer)
+
+
+def accepted_of_different(rows: list[dict[str, Any]]) -> str:
+    """How many pairs of different places were accepted, with the interval of the share."""
+    different = [r for r in rows if not r["matching"]]
+    if not different:
+        return "no maps of different places"
+    wrong = sum(r["accepted"] for r in different)
+    low, high = share_interval(wrong, len(different))
+    return (
+        f"maps of different places: {wrong} of {len(different)} accepted "
+        f"(95 %: {low:.1%} to {high:.1%})"
+    )

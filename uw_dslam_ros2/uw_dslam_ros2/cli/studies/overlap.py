@@ -8,8 +8,6 @@ CSV file, the curve and the reliability diagram.
 from __future__ import annotations
 
 import argparse
-import math
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,14 +19,17 @@ from uw_dslam_ros2.cli.studies._common import (
     print_table,
     progress,
     save_figure,
-    share_interval,
     write_csv,
 )
-from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, is_right, pair_errors, pair_specs
+from uw_dslam_ros2.cli.studies._map_pairs import (
+    SHARES,
+    PairSpec,
+    accepted_of_different,
+    pair_specs,
+    registered,
+    shares,
+)
 from uw_dslam_ros2.cli.studies._real_pairs import has_recording, real_pairs
-from uw_dslam_ros2.core.registration.grids import register_grids
-from uw_dslam_ros2.core.registration.result import RegistrationResult
-from uw_dslam_ros2.core.se2 import wrap_angle
 from uw_dslam_ros2.sim.map_pairs import MapPair
 
 Row = dict[str, Any]
@@ -70,20 +71,10 @@ def run(args: argparse.Namespace) -> int:
         ]
     write_csv(args.out / "pairs.csv", rows)
     print_table(
-        (
-            "noise", "overlap", "pairs", "right", "accepted, right", "accepted, wrong",
-            "certified", "median cells", "median deg", "NEES",
-        ),
+        ("noise", "overlap", "pairs", *SHARES),
         _table(rows, args),
-    )  # fmt: skip
-    different = [r for r in rows if not r["matching"]]
-    wrong = sum(r["accepted"] for r in different)
-    if different:
-        low, high = share_interval(wrong, len(different))
-        print(
-            f"maps of different places: {wrong} of {len(different)} accepted "
-            f"(95 %: {low:.1%} to {high:.1%})"
-        )
+    )
+    print(accepted_of_different(rows))
     seconds = [r["seconds"] for r in rows]
     print(f"time: median {np.median(seconds):.2f} s, p95 {np.quantile(seconds, 0.95):.2f} s")
     _draw_curve(args.out / "overlap.png", rows, args)
@@ -92,36 +83,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _registered(spec: PairSpec, pair: MapPair) -> Row:
-    result = register_grids(pair.source, pair.target, clock=time.monotonic)
-    error_m, error_rad = pair_errors(pair, result.T_target_source)
     return {
         "kind": spec.kind,
         "overlap": spec.overlap,
         "noise": spec.noise,
         "seed": spec.seed,
         "sonar": spec.is_sonar,
-        "matching": pair.T_target_source is not None,
-        "right": is_right(pair, result.T_target_source),
-        "accepted": result.is_accepted,
-        "verdict": result.verdict.name,
-        "certified": result.is_certified,
-        "probability": result.probability,
-        "error_cells": error_m / pair.source.spec.resolution_m,
-        "error_deg": math.degrees(error_rad),
-        "nees": _nees(pair, result),
-        "gap": result.gap,
-        "boxes": result.num_boxes,
-        "seconds": result.seconds,
+        **registered(pair),
     }
-
-
-def _nees(pair: MapPair, result: RegistrationResult) -> float:
-    """Squared error over the stated covariance; 3 on average where that is true."""
-    if pair.T_target_source is None:
-        return math.nan
-    error = result.T_target_source.as_array() - pair.T_target_source.as_array()
-    error[2] = wrap_angle(error[2])
-    return float(error @ np.linalg.solve(result.covariance, error))
 
 
 def _table(rows: list[Row], args: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
@@ -139,19 +108,7 @@ def _table(rows: list[Row], args: argparse.Namespace) -> Iterator[tuple[Any, ...
             groups = {f"{o:.0%}": [r for r in same if r["overlap"] == o] for o in args.overlaps}
         for name, members in groups.items():
             if members:
-                yield noise, name, len(members), *_shares(members)
-
-
-def _shares(rows: list[Row]) -> tuple[str, ...]:
-    right = np.mean([r["right"] for r in rows])
-    kept = [r for r in rows if r["right"] and r["accepted"]]
-    wrong = np.mean([r["accepted"] and not r["right"] for r in rows])
-    answer = [f"{right:.2f}", f"{len(kept) / len(rows):.2f}", f"{wrong:.3f}"]
-    answer.append(f"{np.mean([r['certified'] for r in rows if r['accepted']] or [0]):.2f}")
-    for name in ("error_cells", "error_deg"):
-        answer.append(f"{np.median([r[name] for r in kept]):.2f}" if kept else "-")
-    answer.append(f"{np.mean([r['nees'] for r in kept]):.1f}" if kept else "-")
-    return tuple(answer)
+                yield noise, name, len(members), *shares(members)
 
 
 def _draw_curve(path: Path, rows: list[Row], args: argparse.Namespace) -> None:
