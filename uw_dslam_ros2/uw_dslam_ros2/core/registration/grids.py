@@ -15,13 +15,13 @@ from uw_dslam_ros2.core.registration.grid_candidates import merge_best, scan_can
 from uw_dslam_ros2.core.registration.grid_config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grid_covariance import pose_covariance
 from uw_dslam_ros2.core.registration.grid_evidence import Found, weigh
+from uw_dslam_ros2.core.registration.grid_frames import GridFrames
 from uw_dslam_ros2.core.registration.grid_preparation import FINE_SIGMA_CELLS, prepare_maps
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grid_search import (
     SearchLimits,
     SearchOutcome,
     search_poses,
-    whole_plane,
 )
 from uw_dslam_ros2.core.registration.grid_symmetry import add_twins
 from uw_dslam_ros2.core.registration.paper_grids import register_grids_by_points
@@ -134,6 +134,7 @@ class _GridMatch:
                 f"{prior.half_width_rad} rad, expected positive numbers"
             )
         self._source, self._target = source, target
+        self._frames = GridFrames(source.spec, target.spec)
         self._config, self._prior, self._clock = config, prior, clock
         self._start_s = clock() if clock is not None else math.nan
         self._is_cancelled = False
@@ -156,7 +157,7 @@ class _GridMatch:
         if isinstance(prepared, str):
             return self._refused(Verdict.TOO_FEW_FEATURES, prepared)
         levels, walls = prepared
-        window = self._window(levels[0])
+        window = self._frames.window(levels[0], self._prior)
         candidates, chance = scan_candidates(levels[0], window)
         found = weigh(walls, levels, window, candidates, chance)
         verdict, _, _ = decide(found.evidence, self._config)
@@ -180,43 +181,12 @@ class _GridMatch:
         if isinstance(prepared, str):
             return None
         levels, walls = prepared
-        window = self._window(levels[0])
+        window = self._frames.window(levels[0], self._prior)
         found = weigh(walls, levels, window, *scan_candidates(levels[0], window))
         weighed = (found.evidence.best, *found.evidence.rivals)
-        motions = [self._to_frame(levels[-1].to_motion(c.pose)) for c in found.refined]
+        motions = [self._frames.to_frames(levels[-1].to_motion(c.pose)) for c in found.refined]
         evidence = _with_twins(found, walls, levels, window).evidence
         return evidence, list(zip(weighed, motions, strict=True))
-
-    def _window(self, problem: GridProblem) -> PoseWindow:
-        """Poses that a prior allows, or all."""
-        plane = whole_plane(problem)
-        if self._prior is None:
-            return plane
-        middle = problem.to_pose(self._to_grid(self._prior.T_target_source))
-        half_rad = min(self._prior.half_width_rad, math.pi)
-        # The prior speaks of where the source's frame lands, the pose of where its centre does.
-        T_grid_frame = self._source.spec.T_frame_grid.inverse()
-        origin = np.array([T_grid_frame.x, T_grid_frame.y]) / problem.resolution_m - 0.5
-        arm = float(np.hypot(*(problem.center - origin)))
-        yaw = self._target.spec.T_frame_grid.yaw
-        spread = (abs(math.cos(yaw)) + abs(math.sin(yaw))) * self._prior.half_width_m
-        half = spread / problem.resolution_m + 2.0 * arm * math.sin(0.5 * half_rad)
-        low = np.maximum(middle[1:] - half, plane.middle[1:] - plane.half[1:])
-        high = np.minimum(middle[1:] + half, plane.middle[1:] + plane.half[1:])
-        high = np.maximum(high, low + 1.0)
-        return PoseWindow(
-            np.array([middle[0], *(0.5 * (low + high))]),
-            np.array([half_rad, *(0.5 * (high - low))]),
-        )
-
-    def _to_grid(self, T_target_source: SE2) -> SE2:
-        """Motion between frames to motion between the grids' own axes."""
-        target, source = self._target.spec.T_frame_grid, self._source.spec.T_frame_grid
-        return target.inverse() @ T_target_source @ source
-
-    def _to_frame(self, T_grids: SE2) -> SE2:
-        target, source = self._target.spec.T_frame_grid, self._source.spec.T_frame_grid
-        return target @ T_grids @ source.inverse()
 
     def _certify(
         self,
@@ -238,7 +208,7 @@ class _GridMatch:
             pose: FloatArray, lower: float, upper: float, num_boxes: int, num_open: int
         ) -> None:
             if progress is not None:
-                motion = self._to_frame(problem.to_motion(pose))
+                motion = self._frames.to_frames(problem.to_motion(pose))
                 progress(Progress("search", lower, upper, num_boxes, num_open, motion))
 
         limits = SearchLimits(self._config.gap, num_boxes, should_stop)
@@ -274,11 +244,13 @@ class _GridMatch:
         if self._is_cancelled:
             verdict = Verdict.BUDGET_EXHAUSTED
             reason = f"cancelled after {outcome.num_boxes} boxes, before the proof was complete"
-        motion = self._to_frame(finest.to_motion(pose))
+        motion = self._frames.to_frames(finest.to_motion(pose))
         bound = outcome.upper_bound / max(score, 1e-12)
         best_score = max(found.evidence.best.score, 1e-9)
         rivals = tuple(
-            Rival(self._to_frame(finest.to_motion(c.pose)), rival.score / best_score, bound)
+            Rival(
+                self._frames.to_frames(finest.to_motion(c.pose)), rival.score / best_score, bound
+            )
             for c, rival in zip(found.refined[1:], found.evidence.rivals, strict=True)
             if rival.score > _RIVAL_SHARE * best_score or verdict is Verdict.AMBIGUOUS
         )
@@ -287,7 +259,11 @@ class _GridMatch:
             verdict=verdict,
             reason=reason,
             T_target_source=motion,
-            covariance=self._covariance(finest, pose, found.evidence, motion),
+            covariance=self._frames.covariance(
+                finest,
+                pose_covariance(finest, pose, FINE_SIGMA_CELLS, found.evidence.slide_share),
+                motion,
+            ),
             probability=probability,
             score=score,
             lower_bound=outcome.lower_bound,
@@ -301,27 +277,9 @@ class _GridMatch:
             num_source_points=len(work.source_points),
             num_target_points=len(work.target_points),
             rivals=rivals,
-            source_points=self._points(source_points, work.resolution_m, self._source),
-            target_points=self._points(work.target_points, work.resolution_m, self._target),
+            source_points=self._frames.source_points(source_points, work),
+            target_points=self._frames.target_points(work.target_points, work),
         )
-
-    def _covariance(
-        self, problem: GridProblem, pose: FloatArray, evidence: MatchEvidence, motion: SE2
-    ) -> FloatArray:
-        """Covariance of ``T_target_source`` [m, m, rad] from that of the pose."""
-        covariance = pose_covariance(problem, pose, FINE_SIGMA_CELLS, evidence.slide_share)
-        rotation = self._target.spec.T_frame_grid.rotation()
-        center = self._points(problem.center[None, :], problem.resolution_m, self._source)[0]
-        arm = motion.rotation() @ center
-        jacobian = np.zeros((3, 3))
-        jacobian[:2, 1:] = rotation * problem.resolution_m
-        jacobian[:2, 0] = (arm[1], -arm[0])  # d(t - R c) / d theta
-        jacobian[2, 0] = 1.0
-        return jacobian @ covariance @ jacobian.T
-
-    @staticmethod
-    def _points(cells: FloatArray, resolution_m: float, occupancy: OccupancyMap) -> FloatArray:
-        return occupancy.spec.T_frame_grid.apply((cells + 0.5) * resolution_m)
 
     def _elapsed(self) -> float:
         return self._clock() - self._start_s if self._clock is not None else math.nan
