@@ -157,7 +157,7 @@ def test_landscape_peaks_are_the_objective_there(problem):
 def test_a_short_budget_still_gives_true_bounds(problem):
     window = grid_search.whole_plane(problem)
     full = _search(problem, window, 0.02)
-    limits = grid_search.SearchLimits(0.02, 3000)
+    limits = grid_search.SearchLimits(0.02, 1000)
     short = grid_search.search_poses(problem, window, window.middle, limits)
     assert not short.is_complete
     assert short.upper_bound >= full.lower_bound

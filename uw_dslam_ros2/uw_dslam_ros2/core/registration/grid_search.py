@@ -1,9 +1,9 @@
 """Certified search of the objective of two maps over all of SE(2).
 
-Boxes of poses are halved in all three directions, one size after the other. A box is dropped once
-its bound says that it cannot beat the best pose found by more than the asked gap; what remains
-when the boxes are small is closed by a second-order bound. The certificate holds for the
-continuous objective of `GridProblem`, not for a lattice of poses.
+Boxes of poses are halved in all three directions, one size after the other, in sweeps at first
+(`grid_sweep`). A box is dropped once its bound says that it cannot beat the best pose found by
+more than the asked gap; what remains when the boxes are small is closed by a second-order bound.
+The certificate holds for the continuous objective of `GridProblem`, not for a lattice of poses.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration import grid_kernels
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.grid_sweep import GridSweep, Tables
 from uw_dslam_ros2.core.registration.signed_field import (
     PAD,
     curvature_tables,
@@ -37,12 +38,17 @@ _SMOOTH_FROM_HALF_CELLS = 0.5
 _SMALLEST_HALF_CELLS = 0.01
 _CHUNK = 2048
 _NUM_OPEN_POSES = 64
+_NUM_PROMISING = 32
 _OCTANTS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
 
 
 @dataclass(frozen=True, slots=True)
 class SearchLimits:
-    """When to stop: relative gap, number of boxes bounded, and a question asked often."""
+    """When to stop: relative gap, number of boxes bounded, and a question asked often.
+
+    A tile of 8 x 8 boxes that a sweep bounds together counts as one: it takes a third of the time
+    of a single box.
+    """
 
     gap: float
     max_boxes: int
@@ -119,6 +125,7 @@ class _Search:
         coarse = [value_tables(field) for field in fields]
         fine = [value_tables(refined(field)) for field in fields]
         curvature = [curvature_tables(field) for field in fields]
+        self._tables = [Tables(1, *coarse), Tables(2, *fine)]
         self._coarse = self._kernel_arguments(coarse, curvature, 1.0)
         self._fine = self._kernel_arguments(fine, curvature, 2.0)
         self._pose = start
@@ -146,8 +153,7 @@ class _Search:
         return self._best / (1.0 - self._limits.gap) if self._best > 0.0 else self._best
 
     def run(self, window: PoseWindow) -> SearchOutcome:
-        boxes, half_rad, half = _roots(window, self._problem.radius)
-        parents = np.full(len(boxes), np.inf)
+        boxes, parents, half_rad, half = self._sweep(window)
         while len(boxes):
             kept = self._bound_level(boxes, parents, half_rad, half)
             if kept is None:
@@ -156,11 +162,30 @@ class _Search:
             if half < _SMALLEST_HALF_CELLS:
                 self._dropped = max(self._dropped, float(bounds.max(initial=-math.inf)))
                 break
-            half_rad, half = 0.5 * half_rad, 0.5 * half
-            steps = _OCTANTS * (2.0 * half_rad, 2.0 * half, 2.0 * half)
-            boxes = (boxes[:, None, :] + steps).reshape(-1, 3)
-            parents = np.repeat(bounds, 8)
+            boxes, parents, half_rad, half = _octants(boxes, bounds, half_rad, half)
         return self._outcome(True)
+
+    def _sweep(self, window: PoseWindow) -> tuple[FloatArray, FloatArray, float, float]:
+        """Boxes that sweeps leave, what bounds them, and their half-widths."""
+        sweep = GridSweep(self._problem, window, self._tables)
+        while sweep.advance(
+            self._threshold, self._limits.max_boxes - self._num_boxes, self._is_stopped_now
+        ):
+            self._num_boxes = sweep.num_tiles
+            poses = sweep.promising(_NUM_PROMISING)
+            values = grid_kernels.objective_at(poses, *self._problem.arguments)
+            pose, value = self._problem.ascend(poses[values.argmax()])
+            if value > self._best:
+                self._pose, self._best = pose, value
+            self._dropped = max(self._dropped, sweep.greatest_below(self._threshold))
+            self._tell(np.array([sweep.greatest]), [], sweep.num_open(self._threshold))
+        if sweep.num_tiles == 0:
+            boxes, half_rad, half = _roots(window, self._problem.radius)
+            return boxes, np.full(len(boxes), np.inf), half_rad, half
+        boxes, bounds = sweep.boxes(self._threshold)
+        if sweep.half <= _SMOOTH_FROM_HALF_CELLS:  # they still have the second bound before them
+            return boxes, bounds, sweep.half_rad, sweep.half
+        return _octants(boxes, bounds, sweep.half_rad, sweep.half)
 
     def _bound_level(
         self, boxes: FloatArray, parents: FloatArray, half_rad: float, half: float
@@ -207,9 +232,12 @@ class _Search:
             self._pose, self._best = self._problem.ascend(boxes[index])
 
     def _is_out_of_budget(self) -> bool:
+        return self._is_stopped_now() or self._num_boxes >= self._limits.max_boxes
+
+    def _is_stopped_now(self) -> bool:
         should_stop = self._limits.should_stop
         self._is_stopped = should_stop is not None and should_stop()
-        return self._is_stopped or self._num_boxes >= self._limits.max_boxes
+        return self._is_stopped
 
     def _tell(self, parents: FloatArray, kept: list[FloatArray], num_open: int) -> None:
         if self._report is None:
@@ -224,6 +252,15 @@ class _Search:
             self._pose, self._best, upper, is_complete, self._is_stopped, self._num_boxes,
             self._open_poses,
         )  # fmt: skip
+
+
+def _octants(
+    boxes: FloatArray, bounds: FloatArray, half_rad: float, half: float
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Boxes of half the size, what bounds them, and their half-widths."""
+    half_rad, half = 0.5 * half_rad, 0.5 * half
+    steps = _OCTANTS * (2.0 * half_rad, 2.0 * half, 2.0 * half)
+    return (boxes[:, None, :] + steps).reshape(-1, 3), np.repeat(bounds, 8), half_rad, half
 
 
 def _roots(window: PoseWindow, radius: float) -> tuple[FloatArray, float, float]:
