@@ -100,7 +100,7 @@ def test_no_pose_of_a_box_exceeds_its_bound(kind, half_rad):
             offsets = np.concatenate([corners, rng.uniform(-1.0, 1.0, (60, 3))])
             values = grid_kernels.objective_at(box + offsets * half, *problem.arguments)
             assert values.max() <= bound
-    assert num_levels == 4
+    assert num_levels == len(grid_sweep._LEVELS)
 
 
 def _sum_of_maxima(problem: GridProblem, box: np.ndarray, half: np.ndarray) -> float:

@@ -39,6 +39,7 @@ _SMALLEST_HALF_CELLS = 0.01
 _CHUNK = 2048
 _NUM_OPEN_POSES = 64
 _NUM_PROMISING = 32
+_LEAST_GAIN = 1e-7  # less is where the climb to the same pose ended
 _OCTANTS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
 
 
@@ -175,7 +176,7 @@ class _Search:
             poses = sweep.promising(_NUM_PROMISING)
             values = grid_kernels.objective_at(poses, *self._problem.arguments)
             pose, value = self._problem.ascend(poses[values.argmax()])
-            if value > self._best:
+            if value > self._best + _LEAST_GAIN:
                 self._pose, self._best = pose, value
             self._dropped = max(self._dropped, sweep.greatest_below(self._threshold))
             self._tell(np.array([sweep.greatest]), [], sweep.num_open(self._threshold))

@@ -18,7 +18,12 @@ from uw_dslam_ros2.core.registration import grid_sweep_kernels
 from uw_dslam_ros2.core.registration.grid_kernels import TABLE_STEP
 from uw_dslam_ros2.core.registration.grid_problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grid_sweep_kernels import SIDE
-from uw_dslam_ros2.core.registration.signed_field import PAD, layer_lookup
+from uw_dslam_ros2.core.registration.signed_field import (
+    PAD,
+    layer_lookup,
+    refined,
+    value_tables,
+)
 
 __all__ = ["GridSweep", "Tables"]
 
@@ -26,11 +31,12 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 TableArray = NDArray[np.int16]
 
-_LEVELS = ((4.0, 1), (2.0, 1), (1.0, 2), (0.5, 2))
-"""Half-widths of cells, and how many table cells a working cell is cut into there, each way."""
+_LEVELS = ((4.0, 1, 1), (2.0, 1, 1), (1.0, 2, 1), (0.5, 2, 1), (0.25, 4, 2))
+"""Half-widths of boxes, table cells to a working cell there, and to a cell of a slab's table."""
 _SLACK_CELLS = 1e-6
+_MAX_TABLE_CELLS = 600_000  # of one side, 16 MB
 _MAX_TILES = 100_000  # of a level; 25 MB
-_LEVEL_COST = 200.0  # of getting a level ready, in single boxes that could be bounded meanwhile
+_LEVEL_COST = 200.0  # of getting tables ready, in single boxes that could be bounded meanwhile
 _ENTRY_COST = 1e-3  # of an entry of a slab's table
 _TILE_COST = 0.3
 _BATCH_COST = 600.0  # between two questions whether to stop
@@ -51,6 +57,7 @@ class _Level:
 
     half: float  # of a cell [working cells]
     scale: int
+    size: int
     num_slabs: int
     shape: tuple[int, int]  # rows and columns of cells
 
@@ -62,6 +69,11 @@ class _Level:
 
 class GridSweep:
     """Bounds of ever smaller boxes of poses around those above a threshold.
+
+    Parameters
+    ----------
+    tables : list of Tables
+        Those that exist already, at least of scale 1; finer ones are made when they are needed.
 
     Attributes
     ----------
@@ -80,14 +92,18 @@ class GridSweep:
 
     def _plan(self) -> list[_Level]:
         levels: list[_Level] = []
-        for half, scale in _LEVELS:
+        fields = self._problem.target_field, self._problem.source_field
+        num_cells = max(field.coefficients.size for field in fields)
+        for half, scale, size in _LEVELS:
+            if scale > 1 and scale**2 * num_cells > _MAX_TABLE_CELLS:
+                break
             if not levels:
                 cols, rows = (math.ceil(float(s) / half - 1e-9) for s in self._window.half[1:])
                 rim = float(self._window.half[0]) * self._problem.radius
                 num_slabs = math.ceil(rim / half)
             else:
                 rows, cols, num_slabs = 2 * rows, 2 * cols, 2 * num_slabs
-            levels.append(_Level(half, scale, num_slabs, (rows, cols)))
+            levels.append(_Level(half, scale, size, num_slabs, (rows, cols)))
         return levels
 
     @property
@@ -114,7 +130,7 @@ class GridSweep:
         costs = np.cumsum(_TILE_COST + changes * self._num_entries(level) * _ENTRY_COST)
         if not 0 < len(tiles) <= min(max_tiles, _MAX_TILES):
             return False
-        if _LEVEL_COST + costs[-1] > self._num_boxes(threshold, level):
+        if _LEVEL_COST * level.scale + costs[-1] > self._num_boxes(threshold, level):
             return False
         sums = np.empty((len(tiles), SIDE * SIDE), np.float32)
         ends = np.searchsorted(costs, np.arange(_BATCH_COST, costs[-1], _BATCH_COST))
@@ -210,10 +226,10 @@ class GridSweep:
     def _num_entries(self, level: _Level) -> float:
         """Table cells of a slab."""
         bounds = self._bounds()
-        return level.scale**2 * float(np.prod(bounds[2:] - bounds[:2]))
+        return (level.scale / level.size) ** 2 * float(np.prod(bounds[2:] - bounds[:2]))
 
     def _arguments(self, level: _Level) -> tuple[object, ...]:
-        problem, tables = self._problem, self._tables[level.scale]
+        problem, tables = self._problem, self._tables_of(level.scale)
         delta = float(self._window.half[0]) / level.num_slabs
         strips, first, slots = self._strips(level, delta)
         weights = problem.source_weights, problem.target_weights
@@ -228,16 +244,24 @@ class GridSweep:
             first_theta, delta, level.half, self._low(level), np.array(level.shape),
             problem.source_points, weights[0], strips, first, slots,
             problem.target_points, weights[1], tables.source, level.scale * (PAD - 2.0),
-            self._bounds(), problem.center, PAD + 0.5, float(level.scale), TABLE_STEP,
-            layer_lookup()[0], level.step, margin, _SLACK_CELLS,
+            self._bounds(), problem.center, PAD + 0.5, float(level.scale), float(level.size),
+            TABLE_STEP, layer_lookup()[0], level.step, margin, _SLACK_CELLS,
         )  # fmt: skip
+
+    def _tables_of(self, scale: int) -> Tables:
+        if scale not in self._tables:
+            fields = [self._problem.target_field, self._problem.source_field]
+            for _ in range(scale.bit_length() - 1):
+                fields = [refined(field) for field in fields]
+            self._tables[scale] = Tables(scale, *(value_tables(field) for field in fields))
+        return self._tables[scale]
 
     def _strips(self, level: _Level, delta: float) -> tuple[TableArray, int, IntArray]:
         """Strips of the target's tables that are used, the table cell that they count from, slots.
 
         Slots (L,) tell for every table where its strips are, -1 where they are not.
         """
-        tables, step = self._tables[level.scale].target, level.step
+        tables, step = self._tables_of(level.scale).target, level.step
         layer_of_width, width_of_layer = layer_lookup()
         reach = float(np.sqrt((self._problem.source_points**2).sum(axis=1).max())) * min(
             delta, 2.0

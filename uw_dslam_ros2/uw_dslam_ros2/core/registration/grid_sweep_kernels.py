@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 __all__ = ["SIDE", "bound_tiles", "cut_strips", "slide_back", "split_tiles", "turned_maxima"]
 
 FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
 IntArray = NDArray[np.int64]
 SumArray = NDArray[np.float32]
 TableArray = NDArray[np.int16]
@@ -42,22 +43,24 @@ def cut_strips(table: TableArray, first: int, step: int, strips: TableArray) -> 
     """
     num_rows, num_cols = table.shape
     cols, rows = strips.shape[2], strips.shape[3]
-    line = np.zeros(cols + SIDE, np.int16)
+    plane = np.empty((rows, cols + SIDE), np.int16)
     for phase_row in range(step):
         for phase_col in range(step):
-            into = strips[phase_row, phase_col]
+            begin = first + phase_col
+            low = max(0, -(begin // step))  # the first that is not negative
+            high = min(cols + SIDE, (num_cols - 1 - begin) // step + 1)
             for k in range(rows):
                 row = first + phase_row + k * step
+                line = plane[k]
                 line[:] = 0
                 if 0 <= row < num_rows:
-                    begin = first + phase_col
-                    low = max(0, -(begin // step))  # the first that is not negative
-                    high = min(cols + SIDE, (num_cols - 1 - begin) // step + 1)
                     for j in range(low, high):
                         line[j] = table[row, begin + j * step]
-                for j in range(cols):
+            for j in range(cols):
+                into = strips[phase_row, phase_col, j]
+                for k in range(rows):
                     for x in range(SIDE):
-                        into[j, k, x] = line[j + x]
+                        into[k, x] = plane[k, j + x]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -70,62 +73,84 @@ def _clip(low: float, high: float, slope: float, begin: float, end: float) -> tu
 
 
 @njit(cache=True, nogil=True)
+def _fill_wide(
+    begin: int, end: int, lefts: IndexArray, tops: IndexArray, widths: IndexArray, widest: int,
+    tables: TableArray, line: TableArray,
+) -> None:  # fmt: skip
+    """Greatest values over the squares of a row that are wider than the tables' windows."""
+    num_rows, num_cols = tables.shape[1], tables.shape[2]
+    for col in range(begin, end):
+        left, top, width = lefts[col], tops[col], widths[col]
+        if width > widest:
+            best = line[col]
+            for y in range(top, min(top + width, num_rows), widest):
+                for x in range(left, min(left + width, num_cols), widest):
+                    best = max(best, tables[-1, y, x])
+            line[col] = best
+
+
+@njit(cache=True, nogil=True)
 def turned_maxima(
-    theta: float, delta: float, frame: IntArray, scale: float,
+    theta: float, delta: float, frame: IntArray, scale: float, size: float,
     tables: TableArray, rim: float, center: FloatArray, shift: float,
     layer_of_width: IntArray, slack: float, single: TableArray,
 ) -> None:  # fmt: skip
     """Bounds of a field over squares of u, turned back by all rotations of a slab.
 
-    ``single`` (n, m) gets those of table cells of u, from the row and column in ``frame`` on; cell
-    k reaches from k to k + 1. The field is zero within ``rim`` of the border of its tables.
+    ``single`` (n, m) gets those of cells of u, from the row and column in ``frame`` on; cell k
+    reaches from k to k + 1, each ``size`` cells of the tables. There are ``scale`` of these to a
+    working cell. The field is zero within ``rim`` of the border of its tables.
     """
     num_rows, num_cols = tables.shape[1], tables.shape[2]
     rows, cols = single.shape
     cos, sin = math.cos(theta), math.sin(theta)
     arc, sag = math.sin(min(delta, 0.5 * math.pi)), 1.0 - math.cos(delta)
     corner = math.sqrt(2.0)
-    half = 0.5 * min(corner, abs(cos) + abs(sin) + corner * delta) + slack
+    half = 0.5 * size * min(corner, abs(cos) + abs(sin) + corner * delta) + slack
     x0, y0 = scale * (center[0] + shift), scale * (center[1] + shift)
-    last = tables.shape[0] - 1
-    widest = layer_of_width.shape[0] - 1
+    end_x, end_y = num_cols - 1.0, num_rows - 1.0
+    lefts, tops = np.empty(cols, np.int32), np.empty(cols, np.int32)
+    widths = np.empty(cols, np.int32)
+    flat, stride = tables.ravel(), np.int32(num_cols)
+    layers = (layer_of_width * (num_rows * num_cols)).astype(np.int32)
+    widest = np.int32(layers.shape[0] - 1)
+    first_row, first_col = frame[0], frame[1]
+    first_u, last_u = size * first_col, size * (first_col + cols)
+    far_u = max(abs(first_u), abs(last_u))
     for row in range(rows):
-        uy = frame[0] + row + 0.5
-        single[row] = 0
-        # A square can meet the field where the middle, less what it reaches, is inside.
-        far = abs(uy) + max(abs(frame[1]), abs(frame[1] + cols)) + 1.0
-        reach = half + far * (arc + sag)
+        uy = size * (first_row + row + 0.5)
+        line = single[row]
+        line[:] = 0
+        # A square can meet the field where its middle, less what it reaches, is inside.
+        reach = half + (abs(uy) + far_u) * (arc + sag)
         low, high = _clip(
             rim - reach - x0 - sin * uy, num_cols - rim + reach - x0 - sin * uy, cos,
-            frame[1], frame[1] + cols,
+            first_u, last_u,
         )  # fmt: skip
         low, high = _clip(
             rim - reach - y0 - cos * uy, num_rows - rim + reach - y0 - cos * uy, -sin, low, high
         )
-        begin = max(0, math.floor(low - frame[1]) - 1)
-        for col in range(begin, min(cols, math.ceil(high - frame[1]) + 1)):
-            ux = frame[1] + col + 0.5
+        begin = max(0, math.floor(low / size) - first_col - 1)
+        end = min(cols, math.ceil(high / size) - first_col + 1)
+        most = np.int32(0)
+        for col in range(begin, end):
+            ux = first_u + size * (col + 0.5)
             qx, qy = cos * ux + sin * uy, cos * uy - sin * ux
-            ax, ay = abs(qx), abs(qy)
-            half_x = half + ay * arc + ax * sag
-            half_y = half + ax * arc + ay * sag
-            low_x, high_x = qx + x0 - half_x, qx + x0 + half_x
-            low_y, high_y = qy + y0 - half_y, qy + y0 + half_y
-            if (
-                high_x < rim or high_y < rim or low_x >= num_cols - rim or low_y >= num_rows - rim
-            ):  # fmt: skip
-                continue
-            # The rim holds zeros as far as the widest window reaches.
-            left, top = int(max(low_x, 0.0)), int(max(low_y, 0.0))
-            width = max(int(high_x) - left, int(high_y) - top) + 1
-            if width <= widest:
-                single[row, col] = tables[layer_of_width[width], top, left]
-                continue
-            best, side = tables[last, top, left], widest
-            for y in range(top, min(int(high_y) + 1, num_rows), side):
-                for x in range(left, min(int(high_x) + 1, num_cols), side):
-                    best = max(best, tables[last, y, x])
-            single[row, col] = best
+            half_x = half + abs(qy) * arc + abs(qx) * sag
+            half_y = half + abs(qx) * arc + abs(qy) * sag
+            # Outside of the tables everything is zero; truncation is the floor of the rest.
+            left = np.int32(min(max(qx + x0 - half_x, 0.0), end_x))
+            top = np.int32(min(max(qy + y0 - half_y, 0.0), end_y))
+            right = np.int32(min(max(qx + x0 + half_x, 0.0), end_x))
+            bottom = np.int32(min(max(qy + y0 + half_y, 0.0), end_y))
+            width = np.int32(max(right - left, bottom - top) + np.int32(1))
+            lefts[col], tops[col], widths[col] = left, top, width
+            most = max(most, width)
+        for col in range(begin, end):
+            at = layers[np.uint32(min(widths[col], widest))] + tops[col] * stride + lefts[col]
+            line[col] = flat[np.uint32(at)]
+        if most > widest:
+            _fill_wide(begin, end, lefts, tops, widths, widest, tables, line)
 
 
 @njit(cache=True, nogil=True)
@@ -307,7 +332,7 @@ def bound_tiles(
     source: FloatArray, source_weights: FloatArray, strips: TableArray, first: int,
     slot_of_layer: IntArray,
     target: FloatArray, target_weights: FloatArray, tables: TableArray, rim: float,
-    bounds: FloatArray, center: FloatArray, shift: float, scale: float, unit: float,
+    bounds: FloatArray, center: FloatArray, shift: float, scale: float, size: float, unit: float,
     layer_of_width: IntArray, step: int, margin: float, slack: float,
 ) -> None:  # fmt: skip
     """Bounds of all cells of some tiles (K, 3) [slab, row, column] into ``sums`` (K, SIDE^2).
@@ -317,6 +342,7 @@ def bound_tiles(
     rows and columns of cells. Cells outside, and those of which ``parent_sums``, at ``parents``
     (K,), says that they are not above ``threshold``, get -inf. ``strips`` (L, step, step, C, R,
     SIDE) are those of the target's tables, by slots of their layers, ``tables`` the source's.
+    Both have ``scale`` cells to a working cell, the lattice of u one for ``size`` of these.
     ``unit`` is what a table counts in; ``margin`` is added for what float32 may round away;
     ``slack`` widens regions for what double precision may.
     """
@@ -334,6 +360,7 @@ def bound_tiles(
         inverse_factors[j] = target_weights[j] * unit
     flat, turned_flat = strips.ravel(), np.empty(0, np.int16)
     turned_cols, turned_rows = 0, 0
+    stride = round(step / size)
     slab, left_out = -1, 0.0
     for k in range(tiles.shape[0]):
         if tiles[k, 0] != slab:
@@ -344,20 +371,20 @@ def bound_tiles(
                 layer_of_width, slot_of_layer, first, step, slack, places, factors,
             )  # fmt: skip
             _needed(tiles, k, origin, half, target, nearest, farthest)
-            _frame(theta, delta, bounds, nearest, farthest, scale, frame)
+            _frame(theta, delta, bounds, nearest, farthest, scale / size, frame)
             single = np.empty((frame[2], frame[3]), np.int16)
             turned_maxima(
-                theta, delta, frame, scale, tables, rim, center, shift, layer_of_width, slack,
-                single,
+                theta, delta, frame, scale, size, tables, rim, center, shift, layer_of_width,
+                slack, single,
             )  # fmt: skip
-            turned = np.empty((frame[2] + step, frame[3] + step), np.int16)
-            slide_back(single, step, turned)
-            turned_rows = (frame[2] - 1) // step + 2 + 2 * SIDE
-            turned_cols = (frame[3] - 1) // step + 2 + SIDE
-            turned_strips = np.empty((step, step, turned_cols, turned_rows, SIDE), np.int16)
-            cut_strips(turned, -SIDE * step, step, turned_strips)
+            turned = np.empty((frame[2] + stride, frame[3] + stride), np.int16)
+            slide_back(single, stride, turned)
+            turned_rows = (frame[2] - 1) // stride + 2 + 2 * SIDE
+            turned_cols = (frame[3] - 1) // stride + 2 + SIDE
+            turned_strips = np.empty((stride, stride, turned_cols, turned_rows, SIDE), np.int16)
+            cut_strips(turned, -SIDE * stride, stride, turned_strips)
             turned_flat = turned_strips.ravel()
-            _inverse_places(half, origin, target, scale, frame, step, inverse)
+            _inverse_places(half, origin, target, scale / size, frame, stride, inverse)
         row, col = tiles[k, 1], tiles[k, 2]
         total = sums[k]
         total[:] = np.float32(left_out + margin)
@@ -366,7 +393,7 @@ def bound_tiles(
         )
         _add(flat, starts, weights, count, total)
         count = _collect(
-            inverse, inverse_factors, row, col, step, turned_cols, turned_rows, starts, weights
+            inverse, inverse_factors, row, col, stride, turned_cols, turned_rows, starts, weights
         )
         _add(turned_flat, starts, weights, count, total)
         parent = parent_sums[parents[k]]
