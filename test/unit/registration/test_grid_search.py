@@ -74,7 +74,7 @@ def test_no_pose_of_a_box_exceeds_its_bound(problem, half):
     for arguments in (search._coarse, search._fine):
         for is_smooth in (False, True):
             bounds, _ = grid_kernels.bound_boxes(
-                boxes, np.full(40, np.inf), half_rad, half, -np.inf, is_smooth, *arguments
+                boxes, np.full(40, np.inf), half_rad, half, -np.inf, is_smooth, False, *arguments
             )
             for box, bound in zip(boxes, bounds, strict=True):
                 offsets = rng.uniform(-1, 1, (60, 3)) * (half_rad, half, half)
@@ -88,7 +88,7 @@ def test_small_boxes_close_quadratically(problem):
     slack = []
     for half in (0.1, 0.05):
         bounds, _ = grid_kernels.bound_boxes(
-            pose[None, :], np.full(1, np.inf), half / problem.radius, half, -np.inf, True,
+            pose[None, :], np.full(1, np.inf), half / problem.radius, half, -np.inf, True, False,
             *search._fine,
         )  # fmt: skip
         slack.append(bounds[0] - problem.value(pose))
@@ -216,3 +216,18 @@ def test_many_climbs_end_where_each_alone_does(problem):
         np.testing.assert_array_equal(alone, pose)
         assert best == value
         assert value >= problem.value(start)
+
+
+def test_swept_boxes_get_the_second_bound_or_keep_theirs(problem):
+    pose, _ = problem.ascend(scan_landscape(problem, 1).poses[0])
+    search = grid_search._Search(problem, pose, grid_search.SearchLimits(0.1, 1), None)
+    boxes, half_rad = pose + np.array([[0.0, 0.0, 0.0], [0.02, 0.3, -0.2]]), 0.1 / problem.radius
+    bounds = [
+        grid_kernels.bound_boxes(
+            boxes, np.full(2, parent), half_rad, 0.1, -np.inf, True, is_swept, *search._fine
+        )[0]
+        for parent, is_swept in ((np.inf, True), (np.inf, False), (0.01, True))
+    ]
+    assert (bounds[0] >= bounds[1]).all()
+    assert (bounds[0] >= grid_kernels.objective_at(boxes, *problem.arguments)).all()
+    np.testing.assert_array_equal(bounds[2], 0.01)

@@ -140,7 +140,14 @@ def test_bounds_are_sums_of_maxima(kind):
         tables = search._fine if sweep.half < 2.0 else search._coarse
         room = 0.5 if sweep.half < 2.0 else 1.0
         wider, _ = grid_kernels.bound_boxes(
-            boxes, np.full(len(boxes), np.inf), half[0], half[1] + room, -np.inf, False, *tables
+            boxes,
+            np.full(len(boxes), np.inf),
+            half[0],
+            half[1] + room,
+            -np.inf,
+            False,
+            False,
+            *tables,
         )
         assert bounds.mean() <= wider.mean()
 

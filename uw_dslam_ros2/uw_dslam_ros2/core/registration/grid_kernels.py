@@ -364,7 +364,7 @@ def _smooth_bound(
 @njit(cache=True, nogil=True)
 def bound_boxes(
     boxes: FloatArray, parent_bound: FloatArray, half_rad: float, half: float, threshold: float,
-    is_smooth: bool,
+    is_smooth: bool, is_swept: bool,
     source: FloatArray, source_weight: FloatArray, target_field: FloatGrid,
     target_tables: TableArray, target_curvature: TableArray,
     target: FloatArray, target_weight: FloatArray, source_field: FloatGrid,
@@ -375,18 +375,20 @@ def bound_boxes(
     """Upper bounds (K,) over boxes (K, 3) [theta, t_x, t_y] of one size, and values (K,) inside.
 
     ``half_rad`` and ``half`` are the boxes' half-widths. Values are taken at
-    the centres, and -inf where only the tables were asked.
+    the centres, and -inf where only the tables were asked. They are not asked where
+    ``is_swept`` says that ``parent_bound`` is already what they say of the boxes themselves.
     """
     bounds = np.empty(boxes.shape[0])
     values = np.full(boxes.shape[0], -np.inf)
     for k in range(boxes.shape[0]):
         theta, t_x, t_y = boxes[k, 0], boxes[k, 1], boxes[k, 2]
-        bound = _table_bound(
-            theta, t_x, t_y, half_rad, half, threshold, source, source_weight, target_tables,
-            target, target_weight, source_tables, center, pad, scale,
-            layer_of_width, width_of_layer,
-        )  # fmt: skip
-        bound = min(bound, parent_bound[k])
+        bound = parent_bound[k]
+        if not is_swept:
+            bound = min(bound, _table_bound(
+                theta, t_x, t_y, half_rad, half, threshold, source, source_weight, target_tables,
+                target, target_weight, source_tables, center, pad, scale,
+                layer_of_width, width_of_layer,
+            ))  # fmt: skip
         if is_smooth and bound > threshold:
             values[k], smooth = _smooth_bound(
                 theta, t_x, t_y, half_rad, half,

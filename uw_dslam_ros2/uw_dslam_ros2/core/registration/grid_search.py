@@ -35,8 +35,9 @@ TableArray = NDArray[np.int16]
 _ROOT_HALF_CELLS = 8.0
 _FINE_FROM_HALF_CELLS = 2.0
 _SMOOTH_FROM_HALF_CELLS = 0.5
+_SWEPT_FROM_HALF_CELLS = 0.25
 _SMALLEST_HALF_CELLS = 0.01
-_CHUNK = 2048
+_CHUNK = 512  # 10 to 30 ms
 _NUM_OPEN_POSES = 64
 _NUM_PROMISING = 32
 _LEAST_GAIN = 1e-7  # less is where the climb to the same pose ended
@@ -155,8 +156,10 @@ class _Search:
 
     def run(self, window: PoseWindow) -> SearchOutcome:
         boxes, parents, half_rad, half = self._sweep(window)
+        # What sweeps of the finest tables left, only the second bound can exclude.
+        is_swept = half <= _SWEPT_FROM_HALF_CELLS
         while len(boxes):
-            kept = self._bound_level(boxes, parents, half_rad, half)
+            kept = self._bound_level(boxes, parents, half_rad, half, is_swept)
             if kept is None:
                 return self._outcome(False)
             boxes, bounds = kept
@@ -164,6 +167,7 @@ class _Search:
                 self._dropped = max(self._dropped, float(bounds.max(initial=-math.inf)))
                 break
             boxes, parents, half_rad, half = _octants(boxes, bounds, half_rad, half)
+            is_swept = False
         return self._outcome(True)
 
     def _sweep(self, window: PoseWindow) -> tuple[FloatArray, FloatArray, float, float]:
@@ -179,7 +183,7 @@ class _Search:
             if value > self._best + _LEAST_GAIN:
                 self._pose, self._best = pose, value
             self._dropped = max(self._dropped, sweep.greatest_below(self._threshold))
-            self._tell(np.array([sweep.greatest]), [], sweep.num_open(self._threshold))
+            self._tell(sweep.greatest, sweep.num_open(self._threshold))
         if sweep.num_tiles == 0:
             boxes, half_rad, half = _roots(window, self._problem.radius)
             return boxes, np.full(len(boxes), np.inf), half_rad, half
@@ -189,26 +193,30 @@ class _Search:
         return _octants(boxes, bounds, sweep.half_rad, sweep.half)
 
     def _bound_level(
-        self, boxes: FloatArray, parents: FloatArray, half_rad: float, half: float
+        self,
+        boxes: FloatArray,
+        parents: FloatArray,
+        half_rad: float,
+        half: float,
+        is_swept: bool,
     ) -> tuple[FloatArray, FloatArray] | None:
         """Open boxes, promising ones first, and their bounds; None where the budget ran out."""
         is_smooth = half <= _SMOOTH_FROM_HALF_CELLS
         kept_boxes, kept_bounds = [np.empty((0, 3))], [np.empty(0)]
-        num_kept = 0
+        num_kept, greatest = 0, -math.inf
         for first in range(0, len(boxes), _CHUNK):
             chunk = slice(first, first + _CHUNK)
             if self._is_out_of_budget():
-                rest = float(parents[first:].max())
-                open_bounds = [float(b.max(initial=-math.inf)) for b in kept_bounds]
-                self._dropped = max(self._dropped, rest, *open_bounds)
+                self._dropped = max(self._dropped, greatest, float(parents[first:].max()))
                 self._leave(
                     np.concatenate([*kept_boxes, boxes[first:]]),
                     np.concatenate([*kept_bounds, parents[first:]]),
                 )
                 return None
+            tables = self._fine if half <= _FINE_FROM_HALF_CELLS else self._coarse
             bounds, values = grid_kernels.bound_boxes(
-                boxes[chunk], parents[chunk], half_rad, half, self._threshold, is_smooth,
-                *(self._fine if half <= _FINE_FROM_HALF_CELLS else self._coarse),
+                boxes[chunk], parents[chunk], half_rad, half, self._threshold,
+                is_smooth, is_swept, *tables,
             )  # fmt: skip
             self._num_boxes += len(bounds)
             self._improve(boxes[chunk], values)
@@ -217,7 +225,10 @@ class _Search:
             kept_boxes.append(boxes[chunk][is_open])
             kept_bounds.append(bounds[is_open])
             num_kept += int(is_open.sum())
-            self._tell(parents[first:], kept_bounds, num_kept + len(boxes) - first - len(bounds))
+            greatest = max(greatest, float(bounds[is_open].max(initial=-math.inf)))
+            if self._report is not None:
+                upper = max(greatest, float(parents[first:].max()))
+                self._tell(upper, num_kept + len(boxes) - first - len(bounds))
         bounds = np.concatenate(kept_bounds)
         order = np.argsort(-bounds, kind="stable")
         return np.concatenate(kept_boxes)[order], bounds[order]
@@ -240,12 +251,10 @@ class _Search:
         self._is_stopped = should_stop is not None and should_stop()
         return self._is_stopped
 
-    def _tell(self, parents: FloatArray, kept: list[FloatArray], num_open: int) -> None:
-        if self._report is None:
-            return
-        open_bounds = [float(b.max(initial=-math.inf)) for b in kept]
-        upper = max(self._best, self._dropped, float(parents.max()), *open_bounds)
-        self._report(self._pose, self._best, min(upper, 1.0), self._num_boxes, num_open)
+    def _tell(self, open_bound: float, num_open: int) -> None:
+        if self._report is not None:
+            upper = min(max(self._best, self._dropped, open_bound), 1.0)
+            self._report(self._pose, self._best, upper, self._num_boxes, num_open)
 
     def _outcome(self, is_complete: bool) -> SearchOutcome:
         upper = min(max(self._best, self._dropped), 1.0)

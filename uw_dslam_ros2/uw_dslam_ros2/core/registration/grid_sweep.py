@@ -39,7 +39,7 @@ _MAX_TILES = 100_000  # of a level; 25 MB
 _LEVEL_COST = 200.0  # of getting tables ready, in single boxes that could be bounded meanwhile
 _ENTRY_COST = 1e-3  # of an entry of a slab's table
 _TILE_COST = 0.3
-_BATCH_COST = 600.0  # between two questions whether to stop
+_BATCH_COST = 500.0  # between two questions whether to stop
 
 
 @dataclass(frozen=True, slots=True, eq=False)

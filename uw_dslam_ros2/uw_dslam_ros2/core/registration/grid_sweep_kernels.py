@@ -381,9 +381,13 @@ def bound_tiles(
             slide_back(single, stride, turned)
             turned_rows = (frame[2] - 1) // stride + 2 + 2 * SIDE
             turned_cols = (frame[3] - 1) // stride + 2 + SIDE
-            turned_strips = np.empty((stride, stride, turned_cols, turned_rows, SIDE), np.int16)
+            size_strips = stride * stride * turned_cols * turned_rows * SIDE
+            if len(turned_flat) < size_strips:
+                turned_flat = np.empty(size_strips + size_strips // 2, np.int16)
+            turned_strips = turned_flat[:size_strips].reshape(
+                (stride, stride, turned_cols, turned_rows, SIDE)
+            )
             cut_strips(turned, -SIDE * stride, stride, turned_strips)
-            turned_flat = turned_strips.ravel()
             _inverse_places(half, origin, target, scale / size, frame, stride, inverse)
         row, col = tiles[k, 1], tiles[k, 2]
         total = sums[k]
