@@ -34,8 +34,8 @@ FloatArray = NDArray[np.float64]
 TableArray = NDArray[np.int16]
 _ROOT_HALF_CELLS = 8.0
 _FINE_FROM_HALF_CELLS = 2.0
-_SMOOTH_FROM_HALF_CELLS = 0.5
-_SWEPT_FROM_HALF_CELLS = 0.25
+_SMOOTH_FROM_HALF_CELLS = 0.25
+_AGAIN_FROM_HALF_CELLS = 0.5
 _SMALLEST_HALF_CELLS = 0.01
 _CHUNK = 512  # 10 to 30 ms
 _NUM_OPEN_POSES = 64
@@ -157,7 +157,7 @@ class _Search:
     def run(self, window: PoseWindow) -> SearchOutcome:
         boxes, parents, half_rad, half = self._sweep(window)
         # What sweeps of the finest tables left, only the second bound can exclude.
-        is_swept = half <= _SWEPT_FROM_HALF_CELLS
+        is_swept = half <= _SMOOTH_FROM_HALF_CELLS
         while len(boxes):
             kept = self._bound_level(boxes, parents, half_rad, half, is_swept)
             if kept is None:
@@ -188,7 +188,7 @@ class _Search:
             boxes, half_rad, half = _roots(window, self._problem.radius)
             return boxes, np.full(len(boxes), np.inf), half_rad, half
         boxes, bounds = sweep.boxes(self._threshold)
-        if sweep.half <= _SMOOTH_FROM_HALF_CELLS:  # they still have the second bound before them
+        if sweep.half <= _AGAIN_FROM_HALF_CELLS:  # there single boxes have better bounds
             return boxes, bounds, sweep.half_rad, sweep.half
         return _octants(boxes, bounds, sweep.half_rad, sweep.half)
 
