@@ -39,6 +39,7 @@ _MAX_TILES = 100_000  # of a level; 25 MB
 _LEVEL_COST = 200.0  # of getting tables ready, in single boxes that could be bounded meanwhile
 _ENTRY_COST = 1e-3  # of an entry of a slab's table
 _TILE_COST = 0.3
+_FIRST_GAIN = 64.0  # boxes that one of the first level spares, for it lets the next be swept
 _BATCH_COST = 500.0  # between two questions whether to stop
 
 
@@ -206,7 +207,7 @@ class GridSweep:
     def _num_boxes(self, threshold: float, level: _Level) -> float:
         """Single boxes that the search would have to bound instead."""
         if self._at < 0:
-            return float(level.num_slabs * level.shape[0] * level.shape[1])
+            return _FIRST_GAIN * level.num_slabs * level.shape[0] * level.shape[1]
         return 8.0 * self.num_open(threshold)
 
     def _low(self, level: _Level) -> FloatArray:
