@@ -3,9 +3,9 @@
 Evidence of simulated pairs is gathered without the proof: of one place, of different places, of
 symmetric ones, of the two like ends of one basin; half of the pairs once more with a prior window
 of random size. Two small logistic models are fitted: whether a pose is right, from what speaks for
-it by itself, on the best poses and their rivals; and whether the best pose is right, in view of
-its strongest rival. The first model also says which pose is the best, so after it has changed the
-evidence has to be gathered once more for the second to be that of its choices. The models are
+it by itself, on all refined poses; and whether the best pose is right, in view of its strongest
+rival. The first model also says which pose is the best, so after it has changed much the evidence
+has to be gathered once more for the second to be that of its choices. The models are
 judged on other seeds and on kinds of places that the fit never saw. The coefficients that this
 command prints are those of `uw_dslam_ros2.core.registration.verdict.MODELS`.
 """
@@ -58,7 +58,7 @@ _RIDGE = 1.0
 # How rare a basin is whose other end looks the same, against the other places: nothing in the maps
 # of its ends can tell them apart where piers and corners are the same.
 _BASIN_WEIGHT = 0.3
-_RIVAL_WEIGHT = 0.3  # of poses beside the best: there are several in each pair
+_OTHER_WEIGHT = 0.3  # of poses beside that of the highest score: there are several in each pair
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,10 +163,12 @@ def _fitted(trials: list[_Trial]) -> VerdictModels:
     for trial in trials:
         if trial.spec.kind == "symmetric":
             continue
-        for number, (one, is_pose_right) in enumerate(trial.poses):
+        # Not the best by the model that is being replaced: that would fit it to its own errors.
+        highest = max(one.score for one, _ in trial.poses)
+        for one, is_pose_right in trial.poses:
             features.append(pose_features(one, trial.evidence.log_volume))
             is_right.append(is_pose_right)
-            weights.append(trial.weight * (_RIVAL_WEIGHT if number else 1.0))
+            weights.append(trial.weight * (1.0 if one.score == highest else _OTHER_WEIGHT))
     pose = _logistic(features, is_right, weights)
     alone = VerdictModels(pose, (0.0, 1.0, 0.0))
     limit = GridRegistrationConfig().max_rival_probability

@@ -91,8 +91,8 @@ class VerdictModels:
 
 
 MODELS = VerdictModels(
-    pose=(1.054, 5.587, -18.406, 0.86, -6.849, 0.968, -0.429),
-    match=(0.324, 0.887, -1.431),
+    pose=(-2.1782, 5.6615, -18.5572, 0.9167, -6.7008, 0.819, -0.2288),
+    match=(0.3362, 0.7634, -1.1776),
 )
 """Fitted by `study verdict` with its default settings, which prints them."""
 
