@@ -99,7 +99,10 @@ def _pair(size_cells: int, seed: int = 5) -> MapPair:
 
 
 def _request(size_cells: int, seed: int = 5) -> RegisterMaps.Request:
-    pair = _pair(size_cells, seed)
+    return _request_of(_pair(size_cells, seed))
+
+
+def _request_of(pair: MapPair) -> RegisterMaps.Request:
     source, target = (occupancy_to_msg(m, "map", 0) for m in (pair.source, pair.target))
     return RegisterMaps.Request(source=source, target=target)
 
@@ -136,7 +139,8 @@ def cancel(quick: bool) -> None:
     rng, latencies_s, num_feedback, watched_s = np.random.default_rng(0), [], 0, 0.0
     parameters = {"registration.gap": 0.001, "registration.max_boxes": 100_000_000}
     with _server(**parameters) as client:
-        request = _request(400)
+        # Little in common, and a small gap: seconds of search.
+        request = _request_of(make_pair("office", 0.3, "noisy", 5, size_cells=400))
         goal = RegisterMapsAction.Goal(source=request.source, target=request.target)
         _, whole_s = client.ask([request], 1)
         for _ in range(3 if quick else 20):

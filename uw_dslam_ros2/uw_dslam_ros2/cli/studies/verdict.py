@@ -105,8 +105,9 @@ def run(args: argparse.Namespace) -> int:
     for name, trials in (("fitted", fit), ("held out", check)):
         print(f"\n{name}: {len(trials)} answers")
         _print_thresholds(trials, models)
-    print("\nverdicts on the held-out pairs, by the default settings")
-    _print_verdicts(check, models)
+    for name, trials in (("fitted", fit), ("held-out", check)):
+        print(f"\nverdicts on the {name} pairs, by the default settings")
+        _print_verdicts(trials, models)
     _draw(args.out / "reliability.png", {"fitted": fit, "held out": check}, models)
     return 0
 
