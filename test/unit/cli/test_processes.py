@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import textwrap
 import time
@@ -72,6 +73,18 @@ def test_a_stubborn_process_is_killed(children, tmp_path) -> None:
         child = children.start("node", "child_module", ["stubborn", str(tmp_path)])
         _wait_for(tmp_path / "stubborn")
     assert child.poll() == -9
+
+
+def test_children_hear_an_interrupt_that_a_background_job_ignores(children, tmp_path) -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with children:
+            child = children.start("node", "child_module", ["waits", str(tmp_path)])
+            _wait_for(tmp_path / "waits")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert child.poll() == 0
+    assert (tmp_path / "clean").exists()
 
 
 def test_a_failure_ends_all_and_shows_the_log(children, tmp_path) -> None:

@@ -23,6 +23,11 @@ _TAIL_LINES = 15
 _PATIENCE_S = 10.0
 
 
+def _hear_interrupts() -> None:
+    """A shell lets what it runs with ``&`` ignore SIGINT, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class ChildError(UwDslamError):
     """A process ended that should not have."""
 
@@ -50,6 +55,7 @@ class Child:
                 stderr=subprocess.STDOUT,
                 # Ctrl-C in the terminal must reach the parent alone, which ends us in order.
                 start_new_session=True,
+                preexec_fn=_hear_interrupts,
             )
 
     def poll(self) -> int | None:
