@@ -208,6 +208,14 @@ def test_windows_says_which_map_is_too_small(tmp_path, capsys):
     assert "map floor: no two windows of 1200 cells" in capsys.readouterr().err
 
 
+def test_windows_refuses_two_maps_of_one_name(tmp_path, capsys):
+    (tmp_path / "other").mkdir()
+    paths = [_written_place(folder, "floor", 0) for folder in (tmp_path, tmp_path / "other")]
+    assert main(["windows", "--out", str(tmp_path), "--maps", *map(str, paths)]) == 1
+    assert "two files floor.yaml" in capsys.readouterr().err
+    assert not (tmp_path / "windows.csv").exists()
+
+
 def test_outliers_refuses_a_cell_that_is_not_there(tmp_path, capsys):
     arguments = ["--only", "paper", "--cells", "outliers 41%"]
     assert main(["outliers", "--out", str(tmp_path), *arguments]) == 1

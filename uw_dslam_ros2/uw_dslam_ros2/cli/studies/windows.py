@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Cut, register, print tables."""
-    maps = {path.stem: read_map(path) for path in args.maps}
+    maps = _read(args.maps)
     pairs = [pair for number in range(args.places) for pair in _pairs(maps, args, number)]
     rows = [
         {"map": p.kind, "overlap": p.overlap, "noise": p.noise, **registered(p)}
@@ -69,6 +69,18 @@ def run(args: argparse.Namespace) -> int:
     seconds = [r["seconds"] for r in rows]
     print(f"time: median {np.median(seconds):.2f} s, p90 {np.quantile(seconds, 0.9):.2f} s")
     return 0
+
+
+def _read(paths: list[Path]) -> dict[str, OccupancyMap]:
+    """Maps by the names of their files, which the tables go by."""
+    maps: dict[str, OccupancyMap] = {}
+    for path in paths:
+        if path.stem in maps:
+            raise InvalidInputError(
+                f"--maps names two files {path.name}, expected files of different names"
+            )
+        maps[path.stem] = read_map(path)
+    return maps
 
 
 def _pairs(

@@ -218,9 +218,8 @@ class GridSweep:
     def _bounds(self) -> FloatArray:
         """Where the source's field is not zero, [x, y, x, y] about the center."""
         rows, cols = self._problem.source_field.coefficients.shape
-        low = np.full(
-            2, PAD - 2.0
-        )  # half a cell to the first centre, and one that the spline reaches
+        # Half a cell to the first centre, and one that the spline reaches.
+        low = np.full(2, PAD - 2.0)
         high = np.array([cols, rows]) - low
         return np.concatenate([low, high]) - np.tile(self._problem.center + PAD + 0.5, 2)
 
