@@ -20,7 +20,7 @@ def room_map(resolution_m=0.1, T_frame_grid=SE2()):
 
 def room_submap(vehicle_id, sequence=0, revision=0, T_room_submap=SE2(), T_odom_submap=SE2()):
     """A vehicle's submap of the whole room, whose frame lies at `T_room_submap` in it."""
-    from uw_dslam_ros2.core.mapping.submap import Submap
+    from uw_dslam_ros2.core.submap import Submap
 
     stamps_ns = np.arange(1, 4, dtype=np.int64) * 1_000_000_000 * (sequence + 1)
     return Submap(

@@ -15,7 +15,6 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
     RegistrationResult,
@@ -23,6 +22,7 @@ from uw_dslam_ros2.core.registration.result import (
     Verdict,
 )
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.ros.conversions import (
     occupancy_from_msg,
     occupancy_to_msg,

@@ -7,10 +7,10 @@ import numpy as np
 from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
 from uw_dslam_ros2.cli.scoring import Truth
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.merging import MapQueue, MatchRequest
 from uw_dslam_ros2.core.registration import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap
 
 SECOND = 1_000_000_000
 WAY = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.5, 0.2], [3.0, 1.0, 0.3]])

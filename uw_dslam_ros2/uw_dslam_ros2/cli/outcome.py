@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging import (
     Constraint,
     LoopError,
@@ -26,6 +25,7 @@ from uw_dslam_ros2.core.merging import (
 )
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance

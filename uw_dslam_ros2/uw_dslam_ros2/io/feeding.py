@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping import VehicleMapper
-from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.mounting import planar_mount
+from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.events import (
     DepthEvent,
     ImageEvent,

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, QueueState
 from uw_dslam_ros2.core.merging.answers import Answer, Match
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum

@@ -22,9 +22,9 @@ from uw_dslam_msgs.msg import Transform2D
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.mounting import rotation_of_quaternion
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap
 
 __all__ = [
     "check_covariance",

@@ -19,7 +19,6 @@ from uw_dslam_msgs.srv import RegisterMaps
 from visualization_msgs.msg import MarkerArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging import (
     Constraint,
     ConstraintKind,
@@ -29,6 +28,7 @@ from uw_dslam_ros2.core.merging import (
     SubmapState,
 )
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.session import load_session, save_session
 from uw_dslam_ros2.ros.arrivals import Arrivals
 from uw_dslam_ros2.ros.conversions import occupancy_to_msg, submap_from_msg

@@ -12,7 +12,6 @@ from uw_dslam_msgs.msg import Constraint as ConstraintMsg
 from uw_dslam_msgs.msg import SubmapInfo
 from visualization_msgs.msg import Marker, MarkerArray
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,
@@ -20,6 +19,7 @@ from uw_dslam_ros2.core.merging.types import (
     SubmapState,
 )
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.ros.conversions import covariance_to_list, transform2d_to_msg
 
 __all__ = ["constraint_to_msg", "graph_to_markers", "record_to_msg"]

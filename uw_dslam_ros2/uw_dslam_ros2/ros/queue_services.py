@@ -21,8 +21,8 @@ from uw_dslam_msgs.srv import (
 )
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, save_session

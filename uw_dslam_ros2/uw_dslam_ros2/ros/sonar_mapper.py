@@ -17,8 +17,8 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import ConfigError, InvalidInputError
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io import messages
 from uw_dslam_ros2.io.events import (
     DepthEvent,

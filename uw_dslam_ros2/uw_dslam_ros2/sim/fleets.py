@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging import MapQueue, MatchRequest
 from uw_dslam_ros2.core.metrics import align_points
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = [
     "Fleet",

@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 import uw_dslam_ros2
 from uw_dslam_ros2.cli.mapping import OfflineConfig, map_bag, vehicle_of_bag
 from uw_dslam_ros2.cli.scoring import Truth, read_truth
-from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.session import load_session, save_session
 from uw_dslam_ros2.io.trajectories import write_tum

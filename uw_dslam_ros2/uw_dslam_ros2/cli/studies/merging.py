@@ -42,7 +42,6 @@ from uw_dslam_ros2.cli.studies._fleet_missions import (
 )
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest
 from uw_dslam_ros2.core.merging.fusion import fuse_maps
 from uw_dslam_ros2.core.metrics import (
@@ -57,6 +56,7 @@ from uw_dslam_ros2.core.registration.baselines.ndt import ndt
 from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
 from uw_dslam_ros2.sim.fleets import answer_all, make_result
 from uw_dslam_ros2.sim.places import PLACES

@@ -7,8 +7,8 @@ from uw_dslam_ros2.core.mapping.config import (
     SubmapConfig,
     VehicleMapperConfig,
 )
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.mapping.vehicle_mapper import VehicleMapper
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = [
     "LoopConfig",

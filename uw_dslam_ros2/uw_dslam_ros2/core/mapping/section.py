@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.mapping.config import SubmapConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.matcher import thin
 from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid, PackedEvidence
-from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import Detections
+from uw_dslam_ros2.core.submap import Submap
 
 __all__ = ["ClosedSection", "OpenSection"]
 

@@ -17,7 +17,6 @@ from uw_dslam_ros2.core.mapping.fused_map import FusedMap
 from uw_dslam_ros2.core.mapping.local_map import LocalMap
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
-from uw_dslam_ros2.core.mapping.submap import Submap
 from uw_dslam_ros2.core.navigation import NavigationFilter
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
@@ -27,6 +26,7 @@ from uw_dslam_ros2.core.sonar import (
     detections_from_points,
     detections_from_scan,
 )
+from uw_dslam_ros2.core.submap import Submap
 
 __all__ = ["VehicleMapper"]
 

@@ -13,7 +13,6 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.graph import (
     Edge,
     chi2_threshold,
@@ -22,6 +21,7 @@ from uw_dslam_ros2.core.merging.graph import (
     mahalanobis,
 )
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["Side", "consistent_set", "cycle_distance", "cycle_of"]
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
 from uw_dslam_ros2.core.merging.types import MapProvenance
 from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["GlobalMap", "pinned_lattice"]
 

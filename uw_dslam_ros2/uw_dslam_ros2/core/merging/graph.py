@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = [
     "Edge",

@@ -22,7 +22,6 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.descriptors import promise
@@ -30,6 +29,7 @@ from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers, most_promising
 from uw_dslam_ros2.core.merging.settling import Component, Joint
 from uw_dslam_ros2.core.merging.verification import Verifier, is_worth_checking
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["make_growing_plan"]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.settling import Joint
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["joint_of"]
 

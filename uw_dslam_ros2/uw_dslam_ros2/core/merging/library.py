@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.answers import Match
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.descriptors import MapShape, shape_of
@@ -18,6 +17,7 @@ from uw_dslam_ros2.core.merging.odometry import Odometry
 from uw_dslam_ros2.core.merging.settling import Component, Joint, settle
 from uw_dslam_ros2.core.merging.units import StoredSubmap, Unit, render_unit, shared_area_m2
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["Library", "Memory", "milestone"]
 

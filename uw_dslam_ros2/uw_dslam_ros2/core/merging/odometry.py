@@ -8,10 +8,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance, invert_covariance
 from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["Odometry"]
 

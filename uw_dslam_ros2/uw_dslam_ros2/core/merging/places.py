@@ -9,11 +9,11 @@ from collections.abc import Container, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["Ends", "meetings", "pose_uncertainty", "sigma_m", "vague_places"]
 

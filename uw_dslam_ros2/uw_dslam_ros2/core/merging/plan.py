@@ -25,7 +25,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.consistency import Side
@@ -35,6 +34,7 @@ from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.settling import Component, Joint
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.merging.verification import Verifier
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["Plan", "component_numbers", "make_plan", "most_promising"]
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, numbers_of
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Window
@@ -31,6 +30,7 @@ from uw_dslam_ros2.core.merging.types import (
 from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = ["MapQueue"]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.merging.graph import residual
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers
@@ -16,6 +15,7 @@ from uw_dslam_ros2.core.merging.types import (
     SubmapState,
 )
 from uw_dslam_ros2.core.merging.units import StoredSubmap
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["constraints_of", "records_of"]
 

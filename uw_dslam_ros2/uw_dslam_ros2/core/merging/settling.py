@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import networkx as nx
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.answers import MatchKey
 from uw_dslam_ros2.core.merging.graph import Edge, solve_graph
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["Component", "Joint", "LoopError", "loop_errors", "settle"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uw_dslam_ros2.core.grid import GridSpec
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer, MatchKey
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = ["QueueState"]
 

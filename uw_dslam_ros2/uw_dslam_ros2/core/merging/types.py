@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.submap import Submap, SubmapId
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = [
     "Constraint",

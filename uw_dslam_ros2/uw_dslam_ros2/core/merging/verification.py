@@ -8,7 +8,6 @@ from collections.abc import Container, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.mapping.submap import SubmapId
 from uw_dslam_ros2.core.merging.answers import Answer, AnswerBook, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.consistency import Side
@@ -26,6 +25,7 @@ from uw_dslam_ros2.core.merging.settling import Joint
 from uw_dslam_ros2.core.merging.voting import ENOUGH_ODDS, Vote, vote_of, weigh
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["Verifier", "is_worth_checking"]
 
