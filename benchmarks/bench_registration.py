@@ -22,20 +22,20 @@ from harness import Budget, Timing, emit, require, run_cases, timed
 
 from uw_dslam_ros2.cli.studies._trials import ENGINE, ORACLE, TRUTH, Cell, run_cell, summarise
 from uw_dslam_ros2.core.registration import register_point_sets
-from uw_dslam_ros2.core.registration.branch_and_bound import (
+from uw_dslam_ros2.core.registration.baselines.paper_reference import (
+    Boxes,
+    MixturePair,
+    objective,
+    register_reference,
+)
+from uw_dslam_ros2.core.registration.search.branch_and_bound import (
     SearchOutcome,
     SearchSettings,
     Status,
     Term,
     search,
 )
-from uw_dslam_ros2.core.registration.field import Field, mixture_field
-from uw_dslam_ros2.core.registration.reference import (
-    Boxes,
-    MixturePair,
-    objective,
-    register_reference,
-)
+from uw_dslam_ros2.core.registration.search.field import Field, mixture_field
 from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem
 
 _SIGMA_M = 0.1  # the paper's

@@ -17,7 +17,7 @@ from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.vehicle_mapper import VehicleMapper
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest
 from uw_dslam_ros2.core.mounting import StaticFrames
-from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, register_grids
+from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.bags import TransformEvent, TruthEvent, open_bag, read_events

@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
-from uw_dslam_ros2.core.registration.lattice_scan import lattice_maxima
-from uw_dslam_ros2.core.registration.point_evidence import EvidenceModel, Outline
-from uw_dslam_ros2.core.registration.point_input import Pair, cloud_of
-from uw_dslam_ros2.core.registration.refine import PointModel, fit_known
+from uw_dslam_ros2.core.registration.points.correlation import lattice_maxima
+from uw_dslam_ros2.core.registration.points.evidence import EvidenceModel, Outline
+from uw_dslam_ros2.core.registration.points.input import Pair, cloud_of
+from uw_dslam_ros2.core.registration.points.refine import PointModel, fit_known
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.point_sets import PointSetProblem
 

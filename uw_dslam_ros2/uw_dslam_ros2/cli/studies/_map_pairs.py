@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uw_dslam_ros2.cli.studies._common import share_interval
-from uw_dslam_ros2.core.registration.grids import register_grids
+from uw_dslam_ros2.core.registration.grids.register import register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair

@@ -19,8 +19,8 @@ from uw_dslam_ros2.core.registration import (
     register_point_sets,
 )
 from uw_dslam_ros2.core.registration.baselines import icp, point_baselines, procrustes
-from uw_dslam_ros2.core.registration.branch_and_bound import SearchSettings, Term, search
-from uw_dslam_ros2.core.registration.field import mixture_field
+from uw_dslam_ros2.core.registration.search.branch_and_bound import SearchSettings, Term, search
+from uw_dslam_ros2.core.registration.search.field import mixture_field
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem, overlap_problem
 

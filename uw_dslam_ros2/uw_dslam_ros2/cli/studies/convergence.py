@@ -24,14 +24,18 @@ from uw_dslam_ros2.cli.studies._common import (
     save_figure,
     write_csv,
 )
-from uw_dslam_ros2.core.registration.branch_and_bound import (
+from uw_dslam_ros2.core.registration.baselines.paper_reference import (
+    Boxes,
+    MixturePair,
+    register_reference,
+)
+from uw_dslam_ros2.core.registration.search.branch_and_bound import (
     SearchSettings,
     Status,
     Term,
     search,
 )
-from uw_dslam_ros2.core.registration.field import mixture_field
-from uw_dslam_ros2.core.registration.reference import Boxes, MixturePair, register_reference
+from uw_dslam_ros2.core.registration.search.field import mixture_field
 from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem
 
 __all__ = ["add_arguments", "run"]

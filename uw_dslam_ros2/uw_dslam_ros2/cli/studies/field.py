@@ -33,7 +33,7 @@ from uw_dslam_ros2.core.metrics import compare_maps, resample
 from uw_dslam_ros2.core.registration.baselines.icp import icp, many_start_icp
 from uw_dslam_ros2.core.registration.baselines.ndt import ndt
 from uw_dslam_ros2.core.registration.baselines.orb_ransac import orb_ransac
-from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, register_grids
+from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import MapPair
 

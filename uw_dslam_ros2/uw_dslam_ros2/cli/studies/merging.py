@@ -53,7 +53,7 @@ from uw_dslam_ros2.core.metrics import (
 from uw_dslam_ros2.core.registration import RegistrationResult, register_grids
 from uw_dslam_ros2.core.registration.baselines.icp import many_start_icp
 from uw_dslam_ros2.core.registration.baselines.ndt import ndt
-from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId

@@ -18,7 +18,7 @@ from uw_dslam_ros2.core.mapping.matcher import (
 )
 from uw_dslam_ros2.core.mapping.rivals import conflict, rivals, without_direction
 from uw_dslam_ros2.core.mapping.section import ClosedSection
-from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, register_grids
+from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 

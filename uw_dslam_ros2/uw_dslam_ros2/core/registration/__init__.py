@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from uw_dslam_ros2.core.registration.config import RegistrationConfig
-    from uw_dslam_ros2.core.registration.grids import GridRegistrationConfig, register_grids
-    from uw_dslam_ros2.core.registration.pipeline import register_point_sets
+    from uw_dslam_ros2.core.registration.grids.register import (
+        GridRegistrationConfig,
+        register_grids,
+    )
+    from uw_dslam_ros2.core.registration.points.register import register_point_sets
     from uw_dslam_ros2.core.registration.result import (
         PriorWindow,
         Progress,
@@ -31,10 +34,10 @@ __all__ = [
 ]
 
 _HOMES = {
-    "GridRegistrationConfig": "grid_config",
+    "GridRegistrationConfig": "grids.config",
     "RegistrationConfig": "config",
-    "register_grids": "grids",
-    "register_point_sets": "pipeline",
+    "register_grids": "grids.register",
+    "register_point_sets": "points.register",
 }
 
 

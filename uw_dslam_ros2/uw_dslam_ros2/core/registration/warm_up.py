@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
-from uw_dslam_ros2.core.registration.grid_warm_up import warm_up as warm_up_grids
-from uw_dslam_ros2.core.registration.pipeline import register_point_sets
+from uw_dslam_ros2.core.registration.grids.warm_up import warm_up as warm_up_grids
+from uw_dslam_ros2.core.registration.points.register import register_point_sets
 
 __all__ = ["warm_up"]
 

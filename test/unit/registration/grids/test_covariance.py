@@ -1,0 +1,86 @@
+"""The covariance of a match of maps, against gradients, scatter and straight walls."""
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.features.grid_filter import clean_cells
+from uw_dslam_ros2.core.registration.grids import kernels as grid_kernels
+from uw_dslam_ros2.core.registration.grids.covariance import (
+    curvature,
+    pose_covariance,
+    slide_share,
+)
+from uw_dslam_ros2.core.registration.grids.problem import GridProblem, build_problem
+from uw_dslam_ros2.core.se2 import SE2, wrap_angle
+from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
+
+_SIGMA_CELLS = 2.0
+_NUM_DEGREES = 3.0  # of freedom: the expectation of a NEES
+
+
+def _problem(pair: MapPair) -> GridProblem:
+    return build_problem(
+        clean_cells(pair.source), clean_cells(pair.target),
+        stride=1, sigma_cells=_SIGMA_CELLS, free_penalty=0.7, max_points=1200,
+    )  # fmt: skip
+
+
+def _truth(pair: MapPair, problem: GridProblem) -> np.ndarray:
+    target, source = pair.target.spec.T_frame_grid, pair.source.spec.T_frame_grid
+    return problem.to_pose(target.inverse() @ pair.T_target_source @ source)
+
+
+@pytest.fixture(scope="module")
+def pair() -> MapPair:
+    return make_pair("harbour", 0.7, "noisy", 4, size_cells=160)
+
+
+def test_the_points_gradients_add_up_to_that_of_the_objective(pair):
+    problem = _problem(pair)
+    pose = _truth(pair, problem) + np.array([0.01, 0.7, -0.4])
+    gradients, places = grid_kernels.point_gradients(pose, *problem.arguments)
+    _, *whole = grid_kernels.objective(pose, *problem.arguments)
+    assert gradients.sum(axis=0) == pytest.approx(whole, abs=1e-12)
+    turned = SE2(*pose[1:], pose[0]).apply(problem.source_points)
+    assert places[: len(turned)] == pytest.approx(turned)
+    assert np.array_equal(places[len(turned) :], problem.target_points)
+
+
+def test_the_curvature_is_that_of_finite_differences_of_the_value(pair):
+    problem = _problem(pair)
+    pose, value = problem.ascend(_truth(pair, problem))
+    hessian = curvature(problem, pose)
+    assert np.array_equal(hessian, hessian.T)
+    for axis, scale in enumerate((1.0 / problem.radius, 1.0, 1.0)):
+        step = np.zeros(3)
+        step[axis] = 0.5 * scale
+        ahead, behind = problem.value(pose + step), problem.value(pose - step)
+        assert (2.0 * value - ahead - behind) / 0.25 == pytest.approx(hessian[axis, axis], rel=0.2)
+
+
+@pytest.mark.parametrize(("noise", "most"), [("clean", 2.0), ("noisy", 2.0), ("hard", 3.0)])
+def test_errors_of_other_places_are_about_as_large_as_stated(noise, most):
+    """Squared errors over covariance, on average over places: neither proud nor timid."""
+    nees = []
+    for kind in ("harbour", "office", "lake"):
+        for seed in range(40, 46):
+            pair = make_pair(kind, 0.7, noise, seed, size_cells=200)
+            problem = _problem(pair)
+            pose, _ = problem.ascend(_truth(pair, problem))
+            error = pose - _truth(pair, problem)
+            error[0] = wrap_angle(error[0])
+            slide = slide_share(problem, pose, 10.0)
+            covariance = pose_covariance(problem, pose, _SIGMA_CELLS, slide)
+            nees.append(float(error @ np.linalg.solve(covariance, error)))
+    assert 0.2 * _NUM_DEGREES < np.mean(nees) < most * _NUM_DEGREES
+    assert np.mean(np.array(nees) > 7.81) <= 0.25  # 95 % quantile of three degrees of freedom
+
+
+def test_a_covariance_is_symmetric_and_positive(pair):
+    problem = _problem(pair)
+    pose, _ = problem.ascend(_truth(pair, problem))
+    covariance = pose_covariance(problem, pose, _SIGMA_CELLS, 0.3)
+    assert covariance == pytest.approx(covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    free = pose_covariance(problem, pose, _SIGMA_CELLS, 0.9)
+    assert np.linalg.eigvalsh(free - covariance).max() > 0.5  # one direction is open

@@ -1,0 +1,1 @@
+"""Registration of two occupancy maps: search, evidence, verdict."""

@@ -1,0 +1,93 @@
+"""Poses worth a closer look: the best of the searched lattice, and how they stand out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.registration.grids.landscape import Landscape, distinct, scan_landscape
+from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.grids.search import SearchOutcome
+from uw_dslam_ros2.core.se2 import wrap_angle
+
+__all__ = ["Candidate", "Chance", "climb", "log_volume", "merge_best", "scan_candidates"]
+
+FloatArray = NDArray[np.float64]
+_NUM_CANDIDATES = 40
+_OWN_PEAK_CELLS = 6.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A pose (3,) of a `GridProblem` and its objective."""
+
+    pose: FloatArray
+    score: float
+
+
+@dataclass(frozen=True, slots=True)
+class Chance:
+    """Mean and standard deviation of the best scores that other rotations reach by chance."""
+
+    mean: float
+    spread: float
+
+    def surprise(self, score: float) -> float:
+        """How far a score lies above chance, in standard deviations of chance."""
+        return (score - self.mean) / self.spread
+
+
+def scan_candidates(problem: GridProblem, window: PoseWindow) -> tuple[list[Candidate], Chance]:
+    """Local maxima of a window, best first, and what chance reaches."""
+    landscape = scan_landscape(problem, _NUM_CANDIDATES, window)
+    candidates = climb(problem, landscape.poses)
+    candidates = [c for c in candidates if _is_inside(window, c.pose)]
+    if not candidates:
+        candidates = [Candidate(window.middle, problem.value(window.middle))]
+    return candidates, _chance(candidates[0], landscape, problem.radius)
+
+
+def climb(problem: GridProblem, poses: FloatArray) -> list[Candidate]:
+    """Local maxima from poses (K, 3), best first, apart from each other."""
+    if len(poses) == 0:
+        return []
+    found, values = problem.ascend_all(poses)
+    order = np.argsort(-values, kind="stable")
+    found, values = found[order], values[order]
+    kept = distinct(found, problem.radius, 4.0, len(found))
+    return [Candidate(found[k], float(values[k])) for k in kept]
+
+
+def merge_best(
+    problem: GridProblem, candidates: list[Candidate], outcome: SearchOutcome
+) -> list[Candidate]:
+    """Candidates with the best pose of a search, and what is in the boxes that it left open."""
+    found = [Candidate(outcome.pose, outcome.lower_bound), *climb(problem, outcome.open_poses)]
+    merged = sorted([*found, *candidates], key=lambda c: -c.score)
+    stacked = np.array([c.pose for c in merged])
+    return [merged[k] for k in distinct(stacked, problem.radius, 1.0, _NUM_CANDIDATES)]
+
+
+def log_volume(problem: GridProblem, window: PoseWindow) -> float:
+    """Logarithm of the number of poses in a window that differ by a cell, at the rim for turns."""
+    sizes = 2.0 * window.half * (problem.radius, 1.0, 1.0)
+    return float(np.log(np.maximum(sizes, 1.0)).sum())
+
+
+def _is_inside(window: PoseWindow, pose: FloatArray) -> bool:
+    offset = pose - window.middle
+    offset[0] = wrap_angle(float(offset[0]))
+    return bool((np.abs(offset) <= window.half + 1e-9).all())
+
+
+def _chance(best: Candidate, landscape: Landscape, radius: float) -> Chance:
+    offset = landscape.chance_poses - best.pose
+    turn = np.abs((offset[:, 0] + math.pi) % (2.0 * math.pi) - math.pi)
+    is_own = (turn * radius < _OWN_PEAK_CELLS) & (
+        np.hypot(offset[:, 1], offset[:, 2]) < _OWN_PEAK_CELLS
+    )
+    others = landscape.chance_scores[~is_own]
+    return Chance(float(np.mean(others)), max(float(np.std(others)), 0.02 * best.score, 1e-9))

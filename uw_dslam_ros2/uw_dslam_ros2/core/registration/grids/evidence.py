@@ -1,0 +1,103 @@
+"""Evidence for the best of some poses, and against it: what the verdict judges by."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.registration.grids.agreement import WallMap, measure_agreement
+from uw_dslam_ros2.core.registration.grids.candidates import Candidate, Chance, climb, log_volume
+from uw_dslam_ros2.core.registration.grids.covariance import slide_share
+from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.grids.verdict import MatchEvidence, PoseEvidence, pose_logit
+from uw_dslam_ros2.core.se2 import SE2, wrap_angle
+
+__all__ = ["Found", "Judge", "is_same_pose", "refine", "weigh"]
+
+FloatArray = NDArray[np.float64]
+_NUM_REFINED = 12
+_SLIDE_CELLS = 10.0
+_SAME_CELLS = 8.0  # poses nearer than that, in cells of their level, are one answer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Poses of the finest level, best first, the evidence, and what chance reaches."""
+
+    refined: list[Candidate]
+    evidence: MatchEvidence
+    chance: Chance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judge:
+    """What two maps say about one pose after the other.
+
+    ``levels`` are problems from the searched lattice to the finest one; ``sides`` are source and
+    target on the finest.
+    """
+
+    sides: tuple[WallMap, WallMap]
+    levels: list[GridProblem]
+    chance: Chance
+
+    def evidence(self, candidate: Candidate) -> PoseEvidence:
+        """Evidence for a pose of the finest level."""
+        work, finest = self.levels[0], self.levels[-1]
+        T_grids = finest.to_motion(candidate.pose)
+        scale = 1.0 / finest.resolution_m
+        T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
+        surprise = self.chance.surprise(work.value(work.to_pose(T_grids)))
+        return PoseEvidence(measure_agreement(*self.sides, T_cells), candidate.score, surprise)
+
+
+def weigh(
+    sides: tuple[WallMap, WallMap],
+    levels: list[GridProblem],
+    window: PoseWindow,
+    candidates: list[Candidate],
+    chance: Chance,
+) -> Found:
+    """Refine candidates of the searched lattice on the finest one, and compare them.
+
+    ``sides`` and ``levels`` as for `Judge`.
+    """
+    finest, volume = levels[-1], log_volume(levels[0], window)
+    judge = Judge(sides, levels, chance)
+    weighed = [(c, judge.evidence(c)) for c in refine(levels, candidates, _NUM_REFINED)]
+    # The objective counts what overlaps, so a pose that lays much on much may score above the true
+    # one though the maps contradict it: evidence decides.
+    weighed.sort(key=lambda pair: -pose_logit(pair[1], volume))
+    best, _ = weighed[0]
+    apart = [p for p in weighed[1:] if not is_same_pose(finest, p[0].pose, best.pose)]
+    refined, poses = zip(weighed[0], *apart, strict=True)
+    evidence = MatchEvidence(
+        best=poses[0],
+        rivals=poses[1:],
+        slide_share=slide_share(finest, best.pose, _SLIDE_CELLS),
+        log_volume=volume,
+    )
+    return Found(list(refined), evidence, chance)
+
+
+def refine(levels: list[GridProblem], candidates: list[Candidate], limit: int) -> list[Candidate]:
+    """The maxima of the best candidates on the finest level, best first.
+
+    All climb on the first finer level, whose scores rank them far better; ``limit`` go on.
+    """
+    refined = candidates
+    for coarse, fine in itertools.pairwise(levels):
+        poses = [fine.to_pose(coarse.to_motion(c.pose)) for c in refined]
+        refined = climb(fine, np.array(poses))[:limit]
+    return refined[:limit]
+
+
+def is_same_pose(problem: GridProblem, pose: FloatArray, other: FloatArray) -> bool:
+    """Whether two poses (3,) of a level's problem are one answer."""
+    offset = pose - other
+    turn = abs(wrap_angle(float(offset[0]))) * problem.radius
+    return turn <= _SAME_CELLS and math.hypot(offset[1], offset[2]) <= _SAME_CELLS

@@ -1,0 +1,320 @@
+"""Registration of two occupancy maps: search, certificate, refinement, verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.registration.grids.agreement import WallMap
+from uw_dslam_ros2.core.registration.grids.candidates import merge_best, scan_candidates
+from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grids.covariance import pose_covariance
+from uw_dslam_ros2.core.registration.grids.evidence import Found, weigh
+from uw_dslam_ros2.core.registration.grids.frames import GridFrames
+from uw_dslam_ros2.core.registration.grids.paper import register_grids_by_points
+from uw_dslam_ros2.core.registration.grids.preparation import FINE_SIGMA_CELLS, prepare_maps
+from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.grids.search import (
+    SearchLimits,
+    SearchOutcome,
+    search_poses,
+)
+from uw_dslam_ros2.core.registration.grids.symmetry import add_twins
+from uw_dslam_ros2.core.registration.grids.verdict import (
+    MatchEvidence,
+    PoseEvidence,
+    decide,
+    probability_of,
+)
+from uw_dslam_ros2.core.registration.result import (
+    PriorWindow,
+    Progress,
+    RegistrationResult,
+    Rival,
+    Verdict,
+)
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["GridRegistrationConfig", "match_evidence", "register_grids"]
+
+FloatArray = NDArray[np.float64]
+Clock = Callable[[], float]
+
+_NUM_BOXES_OF_REFUSED = 20_000
+_RIVAL_SHARE = 0.5
+_LOOK_FOR_TWINS = 0.5
+_SAME_SCORE = 1e-6
+
+
+def register_grids(
+    source: OccupancyMap,
+    target: OccupancyMap,
+    config: GridRegistrationConfig | None = None,
+    *,
+    prior: PriorWindow | None = None,
+    clock: Clock | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    is_cancelled: Callable[[], bool] | None = None,
+) -> RegistrationResult:
+    """Find the motion that lays the source map on the target map.
+
+    Parameters
+    ----------
+    source, target
+        Maps of any sizes, resolutions and origins, rotated ones included.
+    config
+        Settings; the defaults where None.
+    prior
+        Search only there; all of SE(2) where None.
+    clock
+        Seconds from any start; without it there is no time limit and `RegistrationResult.seconds`
+        is NaN.
+    progress, is_cancelled
+        Called some times a second from this thread; a cancelled search answers BUDGET_EXHAUSTED.
+
+    Returns
+    -------
+    RegistrationResult
+        ``T_target_source`` takes metres in the source grid's frame to metres in the target grid's
+        frame.
+
+    Raises
+    ------
+    InvalidInputError
+        Where a prior's widths are not positive.
+    """
+    config = config or GridRegistrationConfig()
+    source, target = shrink_blocks(source), shrink_blocks(target)
+    if config.method == "paper":
+        return register_grids_by_points(
+            source, target, config,
+            prior=prior, clock=clock, progress=progress, is_cancelled=is_cancelled,
+        )  # fmt: skip
+    match = _GridMatch(source, target, config, prior, clock)
+    return match.run(progress, is_cancelled)
+
+
+def match_evidence(
+    source: OccupancyMap,
+    target: OccupancyMap,
+    config: GridRegistrationConfig | None = None,
+    *,
+    prior: PriorWindow | None = None,
+) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
+    """What `register_grids` would judge by, without the proof; for studies.
+
+    The list holds the evidence of each pose by itself, the best one first, and its
+    ``T_target_source``. None where a map holds too little to be matched.
+    """
+    maps = shrink_blocks(source), shrink_blocks(target)
+    match = _GridMatch(*maps, config or GridRegistrationConfig(), prior, None)
+    return match.collect()
+
+
+class _GridMatch:
+    """One registration; the steps of the recipe in `run`."""
+
+    def __init__(
+        self,
+        source: OccupancyMap,
+        target: OccupancyMap,
+        config: GridRegistrationConfig,
+        prior: PriorWindow | None,
+        clock: Clock | None,
+    ) -> None:
+        if prior is not None and not (prior.half_width_m > 0.0 and prior.half_width_rad > 0.0):
+            raise InvalidInputError(
+                f"the prior's half-widths are {prior.half_width_m} m and "
+                f"{prior.half_width_rad} rad, expected positive numbers"
+            )
+        self._source, self._target = source, target
+        self._frames = GridFrames(source.spec, target.spec)
+        self._config, self._prior, self._clock = config, prior, clock
+        self._start_s = clock() if clock is not None else math.nan
+        self._is_cancelled = False
+
+    def run(
+        self,
+        progress: Callable[[Progress], None] | None,
+        is_cancelled: Callable[[], bool] | None,
+    ) -> RegistrationResult:
+        """The recipe."""
+        for name, occupancy in (("source", self._source), ("target", self._target)):
+            if max(occupancy.spec.shape) > self._config.max_side_cells:
+                rows, cols = occupancy.spec.shape
+                return self._refused(
+                    Verdict.BUDGET_EXHAUSTED,
+                    f"the {name} map has {rows} x {cols} cells, more than the limit of "
+                    f"{self._config.max_side_cells} on a side",
+                )
+        prepared = prepare_maps(self._source, self._target, self._config)
+        if isinstance(prepared, str):
+            return self._refused(Verdict.TOO_FEW_FEATURES, prepared)
+        levels, walls = prepared
+        window = self._frames.window(levels[0], self._prior)
+        candidates, chance = scan_candidates(levels[0], window)
+        found = weigh(walls, levels, window, candidates, chance)
+        verdict, _, _ = decide(found.evidence, self._config)
+        # What the evidence refuses anyway gets a short search, which may find better.
+        num_boxes = self._config.max_boxes
+        if verdict is not Verdict.ACCEPTED:
+            num_boxes = min(num_boxes, _NUM_BOXES_OF_REFUSED)
+        outcome = self._certify(
+            levels[0], window, candidates[0].pose, num_boxes, progress, is_cancelled
+        )
+        is_better = outcome.lower_bound > candidates[0].score * (1.0 + 1e-6)
+        if is_better or (verdict is Verdict.ACCEPTED and not outcome.is_complete):
+            # Where the proof is open, the poses that it could not exclude are rivals like others.
+            candidates = merge_best(levels[0], candidates, outcome)
+            found = weigh(walls, levels, window, candidates, chance)
+        return self._answer(levels, outcome, _with_twins(found, walls, levels, window))
+
+    def collect(self) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
+        """Evidence, and that of each pose by itself; None where a map holds too little."""
+        prepared = prepare_maps(self._source, self._target, self._config)
+        if isinstance(prepared, str):
+            return None
+        levels, walls = prepared
+        window = self._frames.window(levels[0], self._prior)
+        found = weigh(walls, levels, window, *scan_candidates(levels[0], window))
+        weighed = (found.evidence.best, *found.evidence.rivals)
+        motions = [self._frames.to_frames(levels[-1].to_motion(c.pose)) for c in found.refined]
+        evidence = _with_twins(found, walls, levels, window).evidence
+        return evidence, list(zip(weighed, motions, strict=True))
+
+    def _certify(
+        self,
+        problem: GridProblem,
+        window: PoseWindow,
+        start: FloatArray,
+        num_boxes: int,
+        progress: Callable[[Progress], None] | None,
+        is_cancelled: Callable[[], bool] | None,
+    ) -> SearchOutcome:
+        def should_stop() -> bool:
+            if is_cancelled is not None and is_cancelled():
+                self._is_cancelled = True
+                return True
+            clock = self._clock
+            return clock is not None and clock() - self._start_s > self._config.max_seconds
+
+        def report(
+            pose: FloatArray, lower: float, upper: float, num_boxes: int, num_open: int
+        ) -> None:
+            if progress is not None:
+                motion = self._frames.to_frames(problem.to_motion(pose))
+                progress(Progress("search", lower, upper, num_boxes, num_open, motion))
+
+        limits = SearchLimits(self._config.gap, num_boxes, should_stop)
+        return search_poses(problem, window, start, limits, report)
+
+    def _answer(
+        self, levels: list[GridProblem], outcome: SearchOutcome, found: Found
+    ) -> RegistrationResult:
+        work, finest = levels[0], levels[-1]
+        pose, agreement = found.refined[0].pose, found.evidence.best.agreement
+        verdict, reason, probability = decide(found.evidence, self._config)
+        at_work = work.to_pose(finest.to_motion(pose))
+        score, (_, summit) = work.value(at_work), work.ascend(at_work)
+        is_optimum = summit >= (1.0 - self._config.gap) * outcome.lower_bound - _SAME_SCORE
+        if not is_optimum:
+            reason = (
+                f"{reason}; another pose has a higher score, {outcome.lower_bound:.3f} against "
+                f"{score:.3f}, but the maps speak for this one"
+            )
+            if self._config.is_proof_required and verdict is Verdict.ACCEPTED:
+                verdict = Verdict.AMBIGUOUS
+        if verdict is Verdict.ACCEPTED and not outcome.is_complete:
+            # Evidence decides what is right; the proof, how much better another pose could score.
+            open_gap = (
+                f"the proof stopped after {outcome.num_boxes} boxes with a gap of "
+                f"{1.0 - outcome.lower_bound / max(outcome.upper_bound, 1e-12):.0%}, "
+                f"asked were {self._config.gap:.0%}"
+            )
+            if self._config.is_proof_required:
+                verdict, reason = Verdict.BUDGET_EXHAUSTED, open_gap
+            else:
+                reason = f"{reason}; {open_gap}"
+        if self._is_cancelled:
+            verdict = Verdict.BUDGET_EXHAUSTED
+            reason = f"cancelled after {outcome.num_boxes} boxes, before the proof was complete"
+        motion = self._frames.to_frames(finest.to_motion(pose))
+        bound = outcome.upper_bound / max(score, 1e-12)
+        best_score = max(found.evidence.best.score, 1e-9)
+        rivals = tuple(
+            Rival(
+                self._frames.to_frames(finest.to_motion(c.pose)), rival.score / best_score, bound
+            )
+            for c, rival in zip(found.refined[1:], found.evidence.rivals, strict=True)
+            if rival.score > _RIVAL_SHARE * best_score or verdict is Verdict.AMBIGUOUS
+        )
+        source_points = work.source_points + work.center
+        return RegistrationResult(
+            verdict=verdict,
+            reason=reason,
+            T_target_source=motion,
+            covariance=self._frames.covariance(
+                finest,
+                pose_covariance(finest, pose, FINE_SIGMA_CELLS, found.evidence.slide_share),
+                motion,
+            ),
+            probability=probability,
+            score=score,
+            lower_bound=outcome.lower_bound,
+            upper_bound=outcome.upper_bound,
+            is_certified=outcome.is_complete and is_optimum,
+            num_boxes=outcome.num_boxes,
+            seconds=self._elapsed(),
+            overlap=agreement.overlap,
+            conflict_ratio=agreement.conflict,
+            inlier_ratio=agreement.inlier_ratio,
+            num_source_points=len(work.source_points),
+            num_target_points=len(work.target_points),
+            rivals=rivals,
+            source_points=self._frames.source_points(source_points, work),
+            target_points=self._frames.target_points(work.target_points, work),
+        )
+
+    def _elapsed(self) -> float:
+        return self._clock() - self._start_s if self._clock is not None else math.nan
+
+    def _refused(self, verdict: Verdict, reason: str) -> RegistrationResult:
+        """An answer without a search; the guess is the prior, or lays centre on centre."""
+        if self._prior is not None:
+            motion = self._prior.T_target_source
+        else:
+            source, target = (m.spec.corners().mean(axis=0) for m in (self._source, self._target))
+            motion = SE2(float(target[0] - source[0]), float(target[1] - source[1]), 0.0)
+        return RegistrationResult(
+            verdict=verdict,
+            reason=reason,
+            T_target_source=motion,
+            covariance=np.diag([1e6, 1e6, math.pi**2]),
+            probability=0.0,
+            score=0.0,
+            lower_bound=0.0,
+            upper_bound=1.0,
+            is_certified=False,
+            num_boxes=0,
+            seconds=self._elapsed(),
+            overlap=math.nan,
+            conflict_ratio=math.nan,
+            inlier_ratio=0.0,
+            num_source_points=0,
+            num_target_points=0,
+        )
+
+
+def _with_twins(
+    found: Found, walls: tuple[WallMap, WallMap], levels: list[GridProblem], window: PoseWindow
+) -> Found:
+    """Symmetries only matter to a match that would be convincing without them."""
+    if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_TWINS:
+        return found
+    return add_twins(found, walls, levels, window)

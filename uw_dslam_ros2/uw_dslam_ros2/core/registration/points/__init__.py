@@ -1,0 +1,1 @@
+"""Registration of two point sets: search, evidence, verdict."""
