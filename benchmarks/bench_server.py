@@ -28,11 +28,11 @@ from uw_dslam_msgs.action import RegisterMaps as RegisterMapsAction
 from uw_dslam_msgs.msg import Registration
 from uw_dslam_msgs.srv import RegisterMaps
 
-from uw_dslam_ros2.ros.conversions import occupancy_to_msg
+from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg
 from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
 
 _DOMAIN_ID = 77
-_START = "from uw_dslam_ros2.ros.registration_server import main; raise SystemExit(main())"
+_START = "from uw_dslam_ros2.ros.nodes.registration_server import main; raise SystemExit(main())"
 _NAME = "/registration_server/register_maps"
 _TIMEOUT_S = 300.0
 _Response = RegisterMaps.Response

@@ -1,6 +1,6 @@
 """When the vehicles have come to rest."""
 
-from uw_dslam_ros2.ros.arrivals import Arrivals
+from uw_dslam_ros2.ros.plumbing.arrivals import Arrivals
 
 
 def test_nothing_is_expected_before_the_first_and_after_the_last():

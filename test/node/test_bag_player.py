@@ -15,9 +15,9 @@ from tf2_msgs.msg import TFMessage
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.recordings import BagWriter
-from uw_dslam_ros2.ros.bag_player import BagPlayer
-from uw_dslam_ros2.ros.conversions import stamp_ns_from_msg
-from uw_dslam_ros2.ros.qos import STATIC_TF
+from uw_dslam_ros2.ros.convert.core_types import stamp_ns_from_msg
+from uw_dslam_ros2.ros.nodes.bag_player import BagPlayer
+from uw_dslam_ros2.ros.plumbing.qos import STATIC_TF
 
 pytestmark = pytest.mark.ros
 

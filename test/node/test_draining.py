@@ -10,7 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Int32
 
-from uw_dslam_ros2.ros.draining import subscribe_draining
+from uw_dslam_ros2.ros.plumbing.draining import subscribe_draining
 
 pytestmark = pytest.mark.ros
 

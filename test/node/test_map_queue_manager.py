@@ -31,10 +31,10 @@ from visualization_msgs.msg import MarkerArray
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.provenance import read_provenance
-from uw_dslam_ros2.ros.conversions import occupancy_from_msg, submap_to_msg
-from uw_dslam_ros2.ros.map_queue_manager import MapQueueManager
-from uw_dslam_ros2.ros.qos import LATCHED, SUBMAPS
-from uw_dslam_ros2.ros.registration_server import RegistrationServer
+from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, submap_to_msg
+from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
+from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
+from uw_dslam_ros2.ros.plumbing.qos import LATCHED, SUBMAPS
 
 pytestmark = pytest.mark.ros
 

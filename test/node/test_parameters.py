@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 
 pytestmark = pytest.mark.ros
 

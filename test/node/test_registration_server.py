@@ -25,10 +25,10 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration import register_grids
 from uw_dslam_ros2.core.registration.result import Progress
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.ros import registration_server
-from uw_dslam_ros2.ros.conversions import occupancy_to_msg
-from uw_dslam_ros2.ros.registration_messages import refused_registration
-from uw_dslam_ros2.ros.registration_server import RegistrationServer
+from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg
+from uw_dslam_ros2.ros.convert.registration import refused_registration
+from uw_dslam_ros2.ros.nodes import registration_server
+from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
 
 pytestmark = pytest.mark.ros
 

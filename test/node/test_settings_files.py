@@ -9,10 +9,10 @@ pytest.importorskip("rclpy")
 import rclpy
 
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.ros.map_queue_manager import MapQueueManager
-from uw_dslam_ros2.ros.parameter_table import parameter_tables, with_tables
-from uw_dslam_ros2.ros.registration_server import RegistrationServer
-from uw_dslam_ros2.ros.sonar_mapper import SonarMapper
+from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
+from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
+from uw_dslam_ros2.ros.nodes.sonar_mapper import SonarMapper
+from uw_dslam_ros2.ros.plumbing.parameter_table import parameter_tables, with_tables
 
 pytestmark = pytest.mark.ros
 
@@ -83,7 +83,7 @@ def test_typing_error_in_a_file_is_refused(start, tmp_path, text, words):
 
 
 def test_documented_parameters_are_those_of_the_settings():
-    """`./uw python -m uw_dslam_ros2.ros.parameter_table docs/interfaces.md` renews the tables."""
+    """`./uw python -m uw_dslam_ros2.ros.plumbing.parameter_table PAGE` renews the tables."""
     page = (ROOT / "docs" / "interfaces.md").read_text()
     assert with_tables(page) == page
 

@@ -20,9 +20,9 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.messages import stamp_of
-from uw_dslam_ros2.ros.conversions import occupancy_from_msg, stamp_to_msg, submap_from_msg
-from uw_dslam_ros2.ros.qos import LATCHED, STATIC_TF, SUBMAPS
-from uw_dslam_ros2.ros.sonar_mapper import SonarMapper
+from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, stamp_to_msg, submap_from_msg
+from uw_dslam_ros2.ros.nodes.sonar_mapper import SonarMapper
+from uw_dslam_ros2.ros.plumbing.qos import LATCHED, STATIC_TF, SUBMAPS
 
 pytestmark = pytest.mark.ros
 

@@ -4,8 +4,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from uw_dslam_ros2.ros import sparing
-from uw_dslam_ros2.ros.sparing import Sparing
+from uw_dslam_ros2.ros.plumbing import sparing
+from uw_dslam_ros2.ros.plumbing.sparing import Sparing
 
 pytestmark = pytest.mark.ros
 

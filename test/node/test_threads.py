@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from uw_dslam_ros2.ros.playback import Pacer
-from uw_dslam_ros2.ros.registration_jobs import RegistrationJobs
-from uw_dslam_ros2.ros.registration_messages import refused_registration
-from uw_dslam_ros2.ros.worker import Worker
+from uw_dslam_ros2.ros.convert.registration import refused_registration
+from uw_dslam_ros2.ros.plumbing.playback import Pacer
+from uw_dslam_ros2.ros.plumbing.registration_jobs import RegistrationJobs
+from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 pytestmark = pytest.mark.ros
 

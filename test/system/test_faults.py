@@ -18,7 +18,7 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_ros2.cli.processes import Children
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.session import load_session
-from uw_dslam_ros2.ros.conversions import submap_to_msg
+from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -64,7 +64,9 @@ class Mission:
         arguments = ["--ros-args", "-r", f"__node:={name}"]
         for parameter in parameters:
             arguments += ["-p", parameter]
-        return self.children.start(name, f"uw_dslam_ros2.ros.{node}", arguments, may_end=True)
+        return self.children.start(
+            name, f"uw_dslam_ros2.ros.nodes.{node}", arguments, may_end=True
+        )
 
     def close(self):
         self._executor.shutdown()

@@ -137,7 +137,7 @@ def graph(ros_domain_id, tmp_path, mission):
         "ROS_PYTHON_CHECK_FIELDS": "1",
         "ROS_LOG_DIR": str(tmp_path / "ros_logs"),
     }
-    nodes = "uw_dslam_ros2.ros."
+    nodes = "uw_dslam_ros2.ros.nodes."
     with Children(environment, tmp_path / "logs") as children:
         simulated = ["--ros-args", "-p", "use_sim_time:=true"]
         for vehicle in VEHICLES:

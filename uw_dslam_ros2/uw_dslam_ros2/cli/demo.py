@@ -44,6 +44,7 @@ _SETTLE_TIMEOUT_S = 600.0
 # As fast as the mappers keep up: the player holds when one is this far behind, in recorded time.
 # While one searches for a loop the others go on, so it is long.
 _UNLIMITED_RATE = 10_000.0
+_NODES = "uw_dslam_ros2.ros.nodes"
 _CLOCK_HZ = 2.0
 _MAX_LAG_S = 20.0
 
@@ -236,7 +237,7 @@ def _replay(
 ) -> list[str]:
     """Everything from the start of the nodes to the saved session; returns what went wrong."""
     # Only here, so that help and wrong usage are told at once and without ROS.
-    from uw_dslam_ros2.ros.mission_control import MissionControl  # noqa: TID251 (it runs nodes)
+    from uw_dslam_ros2.ros.plumbing.mission_control import MissionControl  # noqa: TID251 (it runs nodes)
 
     domain_id, claim = free_domain()
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -280,12 +281,10 @@ def _start_nodes(children: Children, recordings: _Recordings) -> None:
     for vehicle in recordings.vehicles:
         parameters = ["-r", f"__ns:=/{vehicle}", "-p", "use_sim_time:=true"]
         parameters += ["-p", "is_reliable:=true"]
-        children.start(
-            f"{vehicle}_sonar_mapper", "uw_dslam_ros2.ros.sonar_mapper", [*ros, *parameters]
-        )
-    children.start("registration_server", "uw_dslam_ros2.ros.registration_server", ros)
+        children.start(f"{vehicle}_sonar_mapper", f"{_NODES}.sonar_mapper", [*ros, *parameters])
+    children.start("registration_server", f"{_NODES}.registration_server", ros)
     parameters = ["-p", "use_sim_time:=true"]
-    children.start("map_queue_manager", "uw_dslam_ros2.ros.map_queue_manager", [*ros, *parameters])
+    children.start("map_queue_manager", f"{_NODES}.map_queue_manager", [*ros, *parameters])
 
 
 def _start_player(children: Children, rate: float | None, recordings: _Recordings) -> Child:
@@ -295,7 +294,7 @@ def _start_player(children: Children, rate: float | None, recordings: _Recording
     arguments += ["--wait-for", *topics]
     # The nodes go by the messages' own stamps; every tick of /clock costs each of them a callback.
     arguments += ["--ros-args", "-p", f"clock_hz:={_CLOCK_HZ}"]
-    return children.start("bag_player", "uw_dslam_ros2.ros.bag_player", arguments, may_end=True)
+    return children.start("bag_player", f"{_NODES}.bag_player", arguments, may_end=True)
 
 
 def _follow(control: Any, player: Child, check: Callable[[], None]) -> None:

@@ -20,7 +20,7 @@ from uw_dslam_ros2.core.registration.result import (
     Verdict,
 )
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.ros.conversions import (
+from uw_dslam_ros2.ros.convert.core_types import (
     check_covariance,
     covariance_to_list,
     transform2d_from_msg,

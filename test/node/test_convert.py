@@ -23,7 +23,7 @@ from uw_dslam_ros2.core.registration.result import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.ros.conversions import (
+from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_from_msg,
     occupancy_to_msg,
     path_to_msg,
@@ -32,7 +32,7 @@ from uw_dslam_ros2.ros.conversions import (
     submap_from_msg,
     submap_to_msg,
 )
-from uw_dslam_ros2.ros.registration_messages import (
+from uw_dslam_ros2.ros.convert.registration import (
     options_from_msg,
     options_to_msg,
     registration_from_msg,

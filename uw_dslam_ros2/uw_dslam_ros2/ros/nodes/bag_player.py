@@ -28,11 +28,11 @@ from std_srvs.srv import SetBool
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, UwDslamError
 from uw_dslam_ros2.io.recordings import BagReader, RawMessage, open_bags
-from uw_dslam_ros2.ros.conversions import stamp_ns_from_msg, stamp_to_msg
-from uw_dslam_ros2.ros.node_settings import BagPlayerConfig
-from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
-from uw_dslam_ros2.ros.playback import Pacer
-from uw_dslam_ros2.ros.qos import CLOCK, DEFAULT, PLAYBACK, STATIC_TF
+from uw_dslam_ros2.ros.convert.core_types import stamp_ns_from_msg, stamp_to_msg
+from uw_dslam_ros2.ros.plumbing.node_settings import BagPlayerConfig
+from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.plumbing.playback import Pacer
+from uw_dslam_ros2.ros.plumbing.qos import CLOCK, DEFAULT, PLAYBACK, STATIC_TF
 
 __all__ = ["BagPlayer", "BagPlayerConfig", "main"]
 

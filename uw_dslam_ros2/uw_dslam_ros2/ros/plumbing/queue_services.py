@@ -26,9 +26,9 @@ from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, save_session
-from uw_dslam_ros2.ros.conversions import submap_to_msg
-from uw_dslam_ros2.ros.merge_messages import record_to_msg
-from uw_dslam_ros2.ros.worker import Worker
+from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
+from uw_dslam_ros2.ros.convert.merging import record_to_msg
+from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["QueueOwner", "QueueServices", "has_session"]
 

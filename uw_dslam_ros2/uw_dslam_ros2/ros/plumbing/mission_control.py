@@ -15,7 +15,7 @@ from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.srv import SaveMap, SaveSession
 
 from uw_dslam_ros2.core.errors import DataError
-from uw_dslam_ros2.ros.qos import LATCHED
+from uw_dslam_ros2.ros.plumbing.qos import LATCHED
 
 __all__ = ["MissionControl"]
 

@@ -27,29 +27,29 @@ from uw_dslam_ros2.io.events import (
     ScanEvent,
 )
 from uw_dslam_ros2.io.feeding import SensorEvent, feed
-from uw_dslam_ros2.ros.conversions import (
+from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_to_msg,
     path_to_msg,
     pose_with_covariance_to_msg,
     stamp_to_msg,
     submap_to_msg,
 )
-from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
-from uw_dslam_ros2.ros.draining import subscribe_draining
-from uw_dslam_ros2.ros.frames import (
+from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.plumbing.draining import subscribe_draining
+from uw_dslam_ros2.ros.plumbing.frames import (
     WARNING_PERIOD_S,
     FrameBroadcaster,
     Mounts,
     transform_to_msg,
 )
-from uw_dslam_ros2.ros.node_settings import SonarMapperConfig
-from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
-from uw_dslam_ros2.ros.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
-from uw_dslam_ros2.ros.running import run_node
-from uw_dslam_ros2.ros.sensor_inputs import sensor_inputs
-from uw_dslam_ros2.ros.sparing import Sparing
-from uw_dslam_ros2.ros.stamp_order import StampOrder
-from uw_dslam_ros2.ros.worker import Worker
+from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
+from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
+from uw_dslam_ros2.ros.plumbing.running import run_node
+from uw_dslam_ros2.ros.plumbing.sensor_inputs import sensor_inputs
+from uw_dslam_ros2.ros.plumbing.sparing import Sparing
+from uw_dslam_ros2.ros.plumbing.stamp_order import StampOrder
+from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["SonarMapper", "SonarMapperConfig", "main"]
 

@@ -2,7 +2,7 @@
 
 ::
 
-    ./uw python -m uw_dslam_ros2.ros.parameter_table docs/interfaces.md
+    ./uw python -m uw_dslam_ros2.ros.plumbing.parameter_table docs/interfaces.md
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.merging import MapQueueConfig
 from uw_dslam_ros2.core.registration import GridRegistrationConfig, RegistrationConfig
-from uw_dslam_ros2.ros.node_settings import NODE_CONFIGS
-from uw_dslam_ros2.ros.parameters import parameter_type, settings_of
+from uw_dslam_ros2.ros.plumbing.node_settings import NODE_CONFIGS
+from uw_dslam_ros2.ros.plumbing.parameters import parameter_type, settings_of
 
 __all__ = ["GROUPS", "parameter_tables", "with_tables"]
 
@@ -34,7 +34,7 @@ GROUPS: dict[str, tuple[tuple[str, type[Config]], ...]] = {
 }
 """Groups of parameters of each node, beside its own."""
 
-_BEGIN = "<!-- parameters: written by uw_dslam_ros2.ros.parameter_table -->"
+_BEGIN = "<!-- parameters: written by uw_dslam_ros2.ros.plumbing.parameter_table -->"
 _END = "<!-- end of parameters -->"
 
 

@@ -35,13 +35,13 @@ from uw_dslam_ros2.core.registration import (
 )
 from uw_dslam_ros2.core.registration.result import Progress, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.ros.conversions import occupancy_from_msg, transform2d_to_msg
-from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
-from uw_dslam_ros2.ros.node_settings import RegistrationServerConfig
-from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
-from uw_dslam_ros2.ros.registration_jobs import Job, RegistrationJobs, Search
-from uw_dslam_ros2.ros.registration_messages import options_from_msg, registration_to_msg
-from uw_dslam_ros2.ros.running import run_node
+from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, transform2d_to_msg
+from uw_dslam_ros2.ros.convert.registration import options_from_msg, registration_to_msg
+from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.plumbing.node_settings import RegistrationServerConfig
+from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.plumbing.registration_jobs import Job, RegistrationJobs, Search
+from uw_dslam_ros2.ros.plumbing.running import run_node
 
 __all__ = ["RegistrationServer", "RegistrationServerConfig", "main"]
 

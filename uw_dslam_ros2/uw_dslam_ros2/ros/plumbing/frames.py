@@ -21,8 +21,8 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.mounting import StaticFrames
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.messages import matrix_of_transform
-from uw_dslam_ros2.ros.conversions import quaternion_to_msg
-from uw_dslam_ros2.ros.qos import STATIC_TF, TF
+from uw_dslam_ros2.ros.convert.core_types import quaternion_to_msg
+from uw_dslam_ros2.ros.plumbing.qos import STATIC_TF, TF
 
 __all__ = ["FrameBroadcaster", "Mounts", "transform_to_msg"]
 

@@ -30,29 +30,29 @@ from uw_dslam_ros2.core.merging import (
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.session import load_session, save_session
-from uw_dslam_ros2.ros.arrivals import Arrivals
-from uw_dslam_ros2.ros.conversions import occupancy_to_msg, submap_from_msg
-from uw_dslam_ros2.ros.diagnostics import Diagnostics, Report
-from uw_dslam_ros2.ros.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
-from uw_dslam_ros2.ros.map_publisher import MapPublisher
-from uw_dslam_ros2.ros.merge_messages import (
+from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg, submap_from_msg
+from uw_dslam_ros2.ros.convert.merging import (
     constraint_to_msg,
     graph_to_markers,
     record_to_msg,
 )
-from uw_dslam_ros2.ros.node_settings import MapQueueManagerConfig
-from uw_dslam_ros2.ros.parameters import declare_config, refuse_unknown_parameters
-from uw_dslam_ros2.ros.qos import LATCHED, SUBMAPS
-from uw_dslam_ros2.ros.queue_services import QueueServices, has_session
-from uw_dslam_ros2.ros.registration_clients import RegistrationClients
-from uw_dslam_ros2.ros.registration_messages import (
+from uw_dslam_ros2.ros.convert.registration import (
     options_to_msg,
     refused_registration,
     registration_from_msg,
 )
-from uw_dslam_ros2.ros.running import run_node
-from uw_dslam_ros2.ros.sparing import Sparing
-from uw_dslam_ros2.ros.worker import Worker
+from uw_dslam_ros2.ros.plumbing.arrivals import Arrivals
+from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
+from uw_dslam_ros2.ros.plumbing.map_publisher import MapPublisher
+from uw_dslam_ros2.ros.plumbing.node_settings import MapQueueManagerConfig
+from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.plumbing.qos import LATCHED, SUBMAPS
+from uw_dslam_ros2.ros.plumbing.queue_services import QueueServices, has_session
+from uw_dslam_ros2.ros.plumbing.registration_clients import RegistrationClients
+from uw_dslam_ros2.ros.plumbing.running import run_node
+from uw_dslam_ros2.ros.plumbing.sparing import Sparing
+from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["MapQueueManager", "MapQueueManagerConfig", "main"]
 

@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from uw_dslam_ros2.ros.qos import DEFAULT
+from uw_dslam_ros2.ros.plumbing.qos import DEFAULT
 
 __all__ = ["Diagnostics"]
 

@@ -20,7 +20,7 @@ from uw_dslam_ros2.core.merging.types import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.ros.conversions import covariance_to_list, transform2d_to_msg
+from uw_dslam_ros2.ros.convert.core_types import covariance_to_list, transform2d_to_msg
 
 __all__ = ["constraint_to_msg", "graph_to_markers", "record_to_msg"]
 

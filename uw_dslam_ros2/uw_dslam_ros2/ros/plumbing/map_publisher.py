@@ -10,12 +10,12 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.ros.conversions import (
+from uw_dslam_ros2.ros.convert.core_types import (
     bytes_to_int8_array,
     occupancy_to_msg,
     stamp_to_msg,
 )
-from uw_dslam_ros2.ros.qos import DEFAULT, LATCHED
+from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED
 
 __all__ = ["MapPublisher"]
 

@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.settings import SECTIONS
-from uw_dslam_ros2.ros.node_settings import names_of_all_nodes
+from uw_dslam_ros2.ros.plumbing.node_settings import names_of_all_nodes
 
 __all__ = ["declare_config", "refuse_unknown_parameters", "settings_of"]
 

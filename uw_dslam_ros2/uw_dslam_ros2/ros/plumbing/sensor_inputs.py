@@ -20,7 +20,7 @@ from uw_dslam_ros2.io.events import (
     VelocityEvent,
 )
 from uw_dslam_ros2.io.feeding import SensorEvent
-from uw_dslam_ros2.ros.node_settings import SonarMapperConfig
+from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 
 __all__ = ["SensorInput", "sensor_inputs"]
 

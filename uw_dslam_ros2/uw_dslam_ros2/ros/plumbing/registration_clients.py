@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from uw_dslam_msgs.srv import RegisterMaps
 
-from uw_dslam_ros2.ros.qos import DEFAULT
+from uw_dslam_ros2.ros.plumbing.qos import DEFAULT
 
 __all__ = ["RegistrationClients"]
 

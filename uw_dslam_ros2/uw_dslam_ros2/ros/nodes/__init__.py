@@ -1,0 +1,1 @@
+"""The four nodes, one file each."""
