@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.cli import simulate
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.mounting import StaticFrames, planar_mount
 from uw_dslam_ros2.io.bags import ImageEvent, ImuEvent, TransformEvent, TruthEvent, read_events
@@ -162,11 +161,9 @@ def test_the_default_mission_fits_its_budget(tmp_path):
     assert size * default.num_vehicles * default.duration_s / config.duration_s < 200e6
 
 
-def test_a_mission_is_not_overwritten(tiny, capsys):
+def test_a_mission_is_not_overwritten(tiny):
     with pytest.raises(DataError, match="holds a mission already"):
         simulate_mission(tiny.folder, tiny_mission_config())
-    assert simulate.main(["--out", str(tiny.folder), "--quiet"]) == 2
-    assert "holds a mission already" in capsys.readouterr().err
 
 
 def test_an_interrupted_run_leaves_nothing_and_can_be_repeated(tmp_path):
@@ -186,23 +183,7 @@ def test_an_interrupted_run_leaves_nothing_and_can_be_repeated(tmp_path):
     assert all(bag.exists() for bag in mission.bags)
 
 
-def test_progress_is_a_bar_on_a_terminal_only(tmp_path, capsys):
-    arguments = ["--out", str(tmp_path / "m"), "--vehicles", "1", "--duration", "6"]
-    assert simulate.main([*arguments, "--processes", "1", "--beams", "64"]) == 0
-    lines = capsys.readouterr().err.splitlines()
-    assert 1 <= len(lines) <= 10
-    assert all(line.startswith("simulate: ") and line.endswith(" pings") for line in lines)
-
-
 def test_a_folder_without_mission_is_named(tmp_path, tiny):
     with pytest.raises(DataError, match=r"mission\.json is not a mission's description"):
         read_mission(tmp_path)
     assert read_mission(tiny.folder).bags == tiny.bags
-
-
-def test_command_line(tmp_path, capsys):
-    arguments = ["--out", str(tmp_path / "m"), "--vehicles", "1", "--duration", "3", "--quiet"]
-    assert simulate.main([*arguments, "--processes", "1", "--beams", "64"]) == 0
-    assert "1 bags" in capsys.readouterr().out
-    assert simulate.main([*arguments, "--duration", "-1"]) == 2
-    assert "duration_s is -1.0, expected 2.0 to 7200.0" in capsys.readouterr().err

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.cli.studies.sonar import speckle_statistics
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.clutter import Scatterers
 from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
+from uw_dslam_ros2.sim.speckle import speckle_statistics
 from uw_dslam_ros2.sim.world import Surface, WorldBuilder
 
 WALL = Surface("wall", 0.0, 4.0)

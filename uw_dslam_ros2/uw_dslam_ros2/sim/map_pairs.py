@@ -26,13 +26,17 @@ __all__ = [
     "cut_pair",
     "cut_window",
     "damage",
+    "is_right",
     "make_pair",
     "observe",
+    "pair_errors",
     "windows_about",
 ]
 
 Values = NDArray[np.int8]
 _BEND_CELLS = 300
+_RIGHT_CELLS = 6.0
+_RIGHT_RAD = math.radians(2.0)
 _BUILDINGS = ("corridors", "oblique", "hall", "cellular")
 
 
@@ -338,3 +342,18 @@ def _windows_at_an_end(
     step = size_cells * (1.0 - overlap) * np.array([math.cos(heading), math.sin(heading)])
     yaws = rng.uniform(-math.pi, math.pi, 2)
     return _window_at(first, yaws[0], half), _window_at(first + step, yaws[1], half)
+
+
+def pair_errors(pair: MapPair, T_target_source: SE2) -> tuple[float, float]:
+    """Errors at the source map's middle [m] and in rotation [rad]; infinite without truth."""
+    if pair.T_target_source is None:
+        return math.inf, math.inf
+    middle = pair.source.spec.corners().mean(axis=0)
+    offset = T_target_source.apply(middle) - pair.T_target_source.apply(middle)
+    return float(np.hypot(*offset)), T_target_source.distance_to(pair.T_target_source)[1]
+
+
+def is_right(pair: MapPair, T_target_source: SE2) -> bool:
+    """Within 2 degrees and six cells, 0.30 m at 0.05 m."""
+    error_m, error_rad = pair_errors(pair, T_target_source)
+    return error_rad < _RIGHT_RAD and error_m < _RIGHT_CELLS * pair.source.spec.resolution_m

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from uw_dslam_ros2.cli.studies._map_pairs import is_right
 from uw_dslam_ros2.core.features.grid_filter import clean_cells
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.grids.agreement import Agreement, WallMap, measure_agreement
@@ -24,7 +23,7 @@ from uw_dslam_ros2.core.registration.grids.verdict import (
 )
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import make_pair
+from uw_dslam_ros2.sim.map_pairs import is_right, make_pair
 
 
 def _line(start, end, count=100):

@@ -14,22 +14,17 @@ from uw_dslam_ros2.cli.studies._common import share_interval
 from uw_dslam_ros2.core.registration.grids.register import register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
-from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
+from uw_dslam_ros2.sim.map_pairs import MapPair, is_right, make_pair, pair_errors
 
 __all__ = [
     "SHARES",
     "PairSpec",
     "accepted_of_different",
-    "is_right",
-    "pair_errors",
     "pair_specs",
     "random_prior",
     "registered",
     "shares",
 ]
-
-RIGHT_CELLS = 6.0
-RIGHT_RAD = math.radians(2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,21 +92,6 @@ def random_prior(pair: MapPair, rng: np.random.Generator) -> PriorWindow:
     error = SE2(float(shift[0]), float(shift[1]), float(rng.uniform(-half_rad, half_rad)))
     # Half as much again, for the prior speaks of the source's origin and not of its middle.
     return PriorWindow(about @ error @ about.inverse() @ T_true, 1.5 * half_m, half_rad)
-
-
-def pair_errors(pair: MapPair, T_target_source: SE2) -> tuple[float, float]:
-    """Errors at the source map's middle [m] and in rotation [rad]; infinite without truth."""
-    if pair.T_target_source is None:
-        return math.inf, math.inf
-    middle = pair.source.spec.corners().mean(axis=0)
-    offset = T_target_source.apply(middle) - pair.T_target_source.apply(middle)
-    return float(np.hypot(*offset)), T_target_source.distance_to(pair.T_target_source)[1]
-
-
-def is_right(pair: MapPair, T_target_source: SE2) -> bool:
-    """Within 2 degrees and six cells, 0.30 m at 0.05 m."""
-    error_m, error_rad = pair_errors(pair, T_target_source)
-    return error_rad < RIGHT_RAD and error_m < RIGHT_CELLS * pair.source.spec.resolution_m
 
 
 def registered(pair: MapPair) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from uw_dslam_ros2.cli.studies._common import (
     save_figure,
     write_csv,
 )
-from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, is_right, pair_errors
+from uw_dslam_ros2.cli.studies._map_pairs import PairSpec
 from uw_dslam_ros2.cli.studies._real_pairs import has_recording, real_pairs
 from uw_dslam_ros2.core.features.grid_points import grid_points
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
@@ -35,7 +35,7 @@ from uw_dslam_ros2.core.registration.baselines.ndt import ndt
 from uw_dslam_ros2.core.registration.baselines.orb_ransac import orb_ransac
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import MapPair
+from uw_dslam_ros2.sim.map_pairs import MapPair, is_right, pair_errors
 
 Row = dict[str, Any]
 Method = Callable[[MapPair], SE2 | None]

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from uw_dslam_ros2.cli.studies._common import (
     COLOURS,
@@ -29,9 +28,10 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import Detections, SonarConfig, SonarImage, detect
 from uw_dslam_ros2.sim.sonar import SonarConfig as SimulatedSonar
 from uw_dslam_ros2.sim.sonar import SonarSimulator
+from uw_dslam_ros2.sim.speckle import speckle_of, speckle_statistics
 from uw_dslam_ros2.sim.world import Surface, WorldBuilder
 
-__all__ = ["add_arguments", "run", "speckle_statistics"]
+__all__ = ["add_arguments", "run"]
 
 FloatArray = NDArray[np.float64]
 
@@ -89,30 +89,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def speckle_statistics(pings: NDArray[np.generic]) -> FloatArray:
-    """Coefficient of variation, skewness, correlation of next beams and of next ranges (4,).
-
-    Of intensities (P, R, B) over their local mean, without the margins.
-    """
-    deviation = _deviation(pings)
-
-    def correlation(a: FloatArray, b: FloatArray) -> float:
-        return float((a * b).mean() / math.sqrt((a * a).mean() * (b * b).mean()))
-
-    return np.array([
-        deviation.std(),
-        (deviation**3).mean() / deviation.std() ** 3,
-        correlation(deviation[:, :, 1:], deviation[:, :, :-1]),
-        correlation(deviation[:, 1:], deviation[:, :-1]),
-    ])  # fmt: skip
-
-
-def _deviation(pings: NDArray[np.generic]) -> FloatArray:
-    x = np.asarray(pings, dtype=np.float64)
-    local = np.stack([gaussian_filter(ping, 6.0) for ping in x])
-    return (x / np.maximum(local, 1e-9) - 1.0)[:, 20:-20, 20:-20]
-
-
 def _read(path: Path) -> _Pings:
     try:
         with np.load(path) as data:
@@ -166,7 +142,7 @@ def _draw_histogram(path: Path, real: NDArray[np.uint8], simulated: NDArray[np.u
     made, axes = figure()
     bins = np.linspace(-1.0, 1.5, 60)
     for pings, name in ((real, "Oculus"), (simulated, "simulated")):
-        values = _deviation(pings[:, *_EVEN]).ravel()
+        values = speckle_of(pings[:, *_EVEN]).ravel()
         axes[0, 0].hist(values, bins, density=True, histtype="step", lw=1.5, label=name)
     axes[0, 0].set_xlabel("intensity over its local mean, less 1")
     axes[0, 0].set_ylabel("density")

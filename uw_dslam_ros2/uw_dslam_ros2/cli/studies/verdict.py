@@ -29,7 +29,7 @@ from uw_dslam_ros2.cli.studies._common import (
     save_figure,
     share_interval,
 )
-from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, is_right, random_prior
+from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, random_prior
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, match_evidence
 from uw_dslam_ros2.core.registration.grids.verdict import (
     MATCH_FEATURES,
@@ -44,6 +44,7 @@ from uw_dslam_ros2.core.registration.grids.verdict import (
     rival_probability,
 )
 from uw_dslam_ros2.core.registration.result import Verdict
+from uw_dslam_ros2.sim.map_pairs import is_right
 
 FloatArray = NDArray[np.float64]
 
