@@ -32,9 +32,17 @@ def setting(
     doc: str = "",
     *,
     choices: Sequence[str] | None = None,
+    is_basic: bool = False,
 ) -> Any:
-    """Field of a `Config`: default, inclusive bounds of numbers, a line of text with the unit."""
-    metadata = {"low": low, "high": high, "doc": doc, "choices": tuple(choices or ())}
+    """Field of a `Config`: default, inclusive bounds of numbers, a line of text with the unit.
+
+    Users have reason to set what is basic, since it says what their sensor, vehicle or mission is
+    like; every other setting is for experts, and documented apart.
+    """
+    metadata = {
+        "low": low, "high": high, "doc": doc, "choices": tuple(choices or ()),
+        "is_basic": is_basic,
+    }  # fmt: skip
     return dataclasses.field(default=default, metadata=metadata)
 
 

@@ -22,16 +22,18 @@ __all__ = [
 class OccupancyConfig(Config):
     """The grid and the sonar's inverse sensor model."""
 
-    resolution_m: float = setting(0.05, 0.01, 10.0, "cell size; coarser where the sonar is")
-    hit_log_odds: float = setting(0.7, 0.01, 10.0, "evidence of a strong echo at its own cell")
+    resolution_m: float = setting(
+        0.05, 0.01, 10.0, "cell size of the map [m]; coarser where the sonar is", is_basic=True
+    )
+    hit_log_odds: float = setting(0.7, 0.01, 10.0, "log-odds of a strong echo at its own cell")
     free_log_odds: float = setting(
-        0.15, 0.001, 10.0, "evidence of free water before the first echo"
+        0.15, 0.001, 10.0, "log-odds of free water before the first echo, taken off"
     )
-    log_odds_max: float = setting(4.0, 0.5, 20.0, "a cell's evidence is cut there")
+    log_odds_max: float = setting(4.0, 0.5, 20.0, "limit of a cell's log-odds")
     free_margin_m: float = setting(
-        0.15, 0.0, 10.0, "water this close before an echo stays unknown"
+        0.15, 0.0, 10.0, "water this close before an echo stays unknown [m]"
     )
-    free_range_max_m: float = setting(30.0, 0.1, 1e4, "no free water is seen farther away")
+    free_range_max_m: float = setting(30.0, 0.1, 1e4, "no free water is seen farther away [m]")
     max_spread_m: float = setting(0.5, 0.01, 10.0, "largest half width of an echo across the beam")
     min_motion_m: float = setting(0.1, 0.0, 10.0, "a ping enters the map after this way ...")
     min_turn_rad: float = setting(0.02, 0.0, 3.2, "... or this turn ...")
@@ -42,9 +44,13 @@ class OccupancyConfig(Config):
 class SubmapConfig(Config):
     """When a submap closes: whichever comes first."""
 
-    max_length_m: float = setting(25.0, 0.5, 1e4, "way travelled")
-    max_duration_s: float = setting(120.0, 1.0, 1e5, "time since its first ping")
-    max_sigma_m: float = setting(0.5, 0.01, 1e3, "uncertainty of the position within the submap")
+    max_length_m: float = setting(
+        25.0, 0.5, 1e4, "path length after which a submap closes [m]", is_basic=True
+    )
+    max_duration_s: float = setting(120.0, 1.0, 1e5, "time after which a submap closes [s]")
+    max_sigma_m: float = setting(
+        0.5, 0.01, 1e3, "uncertainty of the position within a submap that closes it [m]"
+    )
     min_pings: int = setting(3, 1, 10000, "no submap closes with fewer pings (but the last)")
 
 
@@ -52,13 +58,19 @@ class SubmapConfig(Config):
 class MatchConfig(Config):
     """Scan-to-submap matching."""
 
-    sigma_m: float = setting(0.12, 0.01, 10.0, "width of the likelihood field: noise of an echo")
-    key_distance_m: float = setting(1.0, 0.0, 100.0, "a ping is matched after this way ...")
-    key_turn_rad: float = setting(0.15, 0.0, 3.2, "... or this turn ...")
-    key_interval_s: float = setting(5.0, 0.0, 1e4, "... or this time")
-    window_m: float = setting(2.0, 0.05, 100.0, "search at most this far from dead reckoning")
-    window_rad: float = setting(0.15, 0.001, 3.2, "search at most this far from its yaw")
-    local_length_m: float = setting(15.0, 0.1, 1e4, "way whose echoes a ping is matched against")
+    sigma_m: float = setting(
+        0.12, 0.01, 10.0, "width of the likelihood field: noise of an echo [m]"
+    )
+    key_distance_m: float = setting(
+        1.0, 0.0, 100.0, "a ping is matched after this path length [m] ..."
+    )
+    key_turn_rad: float = setting(0.15, 0.0, 3.2, "... or this turn [rad] ...")
+    key_interval_s: float = setting(5.0, 0.0, 1e4, "... or this time [s]")
+    window_m: float = setting(2.0, 0.05, 100.0, "search at most this far from dead reckoning [m]")
+    window_rad: float = setting(0.15, 0.001, 3.2, "search at most this far from its yaw [rad]")
+    local_length_m: float = setting(
+        15.0, 0.1, 1e4, "path length whose echoes a ping is matched against [m]"
+    )
     min_points: int = setting(20, 3, 100000, "fewer echoes are not matched")
     max_points: int = setting(300, 10, 100000, "of more echoes an even choice is matched")
     min_overlap: float = setting(0.3, 0.0, 1.0, "share of the echoes that must meet known ones")
@@ -76,9 +88,9 @@ class LoopConfig(Config):
     search_sigma: float = setting(
         3.0, 0.5, 10.0, "search window in standard deviations of the graph"
     )
-    max_window_m: float = setting(15.0, 0.1, 1e3, "largest half width of the search window")
+    max_window_m: float = setting(15.0, 0.1, 1e3, "largest half width of the search window [m]")
     max_window_rad: float = setting(
-        0.35, 0.01, 3.2, "largest half width of the search window in yaw"
+        0.35, 0.01, 3.2, "largest half width of the search window in yaw [rad]"
     )
     min_overlap: float = setting(
         0.3, 0.0, 1.0, "share of the points that must meet the other map to refine its pose"
@@ -126,8 +138,8 @@ class VehicleMapperConfig(Config):
         0.1,
         0.0,
         10.0,
-        "a ping waits until navigation is this far ahead, for messages out of order",
+        "a ping waits until navigation is this far ahead, for messages out of order [s]",
     )
     max_wait_s: float = setting(
-        0.5, 0.0, 60.0, "a ping waits this long for its navigation messages"
+        0.5, 0.0, 60.0, "a ping waits this long for its navigation messages [s]"
     )

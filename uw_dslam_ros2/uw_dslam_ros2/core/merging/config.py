@@ -19,10 +19,16 @@ class MapQueueConfig(Config):
         choices=("graph", "pairwise"),
     )
     anchor_vehicle: str = setting(
-        "", doc="vehicle whose first submap pins the global frame; empty: the first that is joined"
+        "",
+        doc="vehicle whose first submap pins the global frame; empty: the first that is joined",
+        is_basic=True,
     )
     resolution_m: float = setting(
-        0.0, 0.0, 10.0, "cell size of the global map [m]; 0: that of the pinning submap"
+        0.0,
+        0.0,
+        10.0,
+        "cell size of the global map [m]; 0: that of the pinning submap",
+        is_basic=True,
     )
     log_odds_max: float = setting(8.0, 0.5, 50.0, "limit of the global map's log-odds")
     max_submap_cells: int = setting(

@@ -29,6 +29,7 @@ class SonarConfig(Config):
         "amplitude",
         choices=("amplitude", "power"),
         doc="what the image holds: amplitude (Rayleigh noise) or power (exponential noise)",
+        is_basic=True,
     )
     fixed_threshold: float = setting(
         0.3, 0.0, 1.0, "fixed: share of full scale (integers: the type's largest value, floats: 1)"
@@ -50,22 +51,30 @@ class SonarConfig(Config):
         "first", choices=("first", "strongest", "all"), doc="echoes kept in each beam"
     )
     min_separation_m: float = setting(
-        0.3, 0.0, 100.0, "all: least distance of two echoes of one beam"
+        0.3, 0.0, 100.0, "all: least distance of two echoes of one beam [m]"
     )
-    min_range_m: float = setting(0.5, 0.0, 1000.0, "blanking: nothing nearer is an echo")
-    max_range_m: float = setting(1000.0, 0.1, 10000.0, "range gate: nothing farther is an echo")
+    min_range_m: float = setting(
+        0.5, 0.0, 1000.0, "blanking: nothing nearer is an echo [m]", is_basic=True
+    )
+    max_range_m: float = setting(
+        1000.0, 0.1, 10000.0, "range gate: nothing farther is an echo [m]", is_basic=True
+    )
     neighbor_distance_m: float = setting(
         0.5,
         0.0,
         100.0,
-        "distance constraint: an echo needs neighbours this near (beam spread added); 0: off",
+        "an echo needs neighbours this near, or is dropped [m], beam spread added; 0: off, as for "
+        "echoes that are filtered already",
+        is_basic=True,
     )
-    min_neighbors: int = setting(2, 1, 100, "distance constraint: how many neighbours")
+    min_neighbors: int = setting(
+        2, 1, 100, "how many neighbours an echo needs within neighbor_distance_m"
+    )
     beamwidth_rad: float = setting(
-        0.0, 0.0, 1.0, "width of one beam in bearing; 0: as wide as the beams lie apart"
+        0.0, 0.0, 1.0, "width of one beam in bearing [rad]; 0: as wide as the beams lie apart"
     )
     range_sigma_m: float = setting(
-        0.03, 0.0001, 10.0, "standard deviation of a range, at least (a bin adds its own)"
+        0.03, 0.0001, 10.0, "standard deviation of a range, at least (a bin adds its own) [m]"
     )
     no_echo_free_share: float = setting(
         0.5,

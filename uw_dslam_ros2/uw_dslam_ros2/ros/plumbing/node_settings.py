@@ -28,20 +28,27 @@ class SonarMapperConfig(Config):
         "image",
         choices=("image", "scan", "points"),
         doc="what the sonar sends: topic sonar, scan or points",
+        is_basic=True,
     )
     data_order: str = setting(
-        "range_major", choices=DATA_ORDERS, doc="slowest index of a sonar image's bytes"
+        "range_major",
+        choices=DATA_ORDERS,
+        doc="slowest index of a sonar image's bytes",
+        is_basic=True,
     )
     velocity: str = setting(
         "dvl",
         choices=("dvl", "twist"),
         doc="type of the topic dvl: Dvl or TwistWithCovarianceStamped",
+        is_basic=True,
     )
     water_density_kg_m3: float = setting(
         1025.0, 900.0, 1300.0, "turns pressure into depth; fresh water has 1000"
     )
     is_reliable: bool = setting(
-        False, doc="subscribe to sensors reliably: for replays, where nothing may be lost"
+        False,
+        doc="subscribe to sensors reliably: for replays, where nothing may be lost",
+        is_basic=True,
     )
     ping_queue: int = setting(100, 1, 100000, "pings kept while the mapper is busy")
     sensor_queue: int = setting(5000, 1, 1000000, "other messages kept while the mapper is busy")
@@ -64,7 +71,9 @@ class SonarMapperConfig(Config):
 class RegistrationServerConfig(Config):
     """Settings of the registration server."""
 
-    max_parallel: int = setting(0, 0, 256, "searches at a time; 0: as many as cores")
+    max_parallel: int = setting(
+        0, 0, 256, "searches at a time; 0: as many as cores", is_basic=True
+    )
     max_waiting: int = setting(4, 0, 1000, "requests that wait for their turn; more get BUSY")
     max_cells: int = setting(
         36_000_000, 1, 1_000_000_000, "largest map that is accepted, in cells (6000 x 6000)"
@@ -77,12 +86,16 @@ class MapQueueManagerConfig(Config):
     """Settings of the manager as a node; `queue` holds those of the map queue itself."""
 
     vehicles: tuple[str, ...] = setting(
-        (), doc="vehicles whose submaps are taken; empty: every topic of type Submap on the graph"
+        (),
+        doc="vehicles whose submaps are taken; empty: every topic of type Submap on the graph",
+        is_basic=True,
     )
     servers: tuple[str, ...] = setting(
-        (), doc="registration servers (node names) that are asked; empty: all on the graph"
+        (),
+        doc="registration servers (node names) that are asked; empty: all on the graph",
+        is_basic=True,
     )
-    map_frame: str = setting("map", doc="frame of the global map")
+    map_frame: str = setting("map", doc="frame of the global map", is_basic=True)
     requests_per_server: int = setting(2, 1, 1000, "registrations asked of one server at a time")
     request_timeout_s: float = setting(
         180.0, 0.1, 86400.0, "a registration not answered by then is asked again [s]"
@@ -103,6 +116,7 @@ class MapQueueManagerConfig(Config):
     session: str = setting(
         "",
         doc="folder: read at the start where it exists, written after every change; empty: none",
+        is_basic=True,
     )
 
 
@@ -111,11 +125,13 @@ class BagPlayerConfig(Config):
     """Settings of the bag player."""
 
     bags: tuple[str, ...] = setting(
-        (), doc="rosbag2 folders, .mcap or .db3 files; several play on one clock"
+        (), doc="rosbag2 folders, .mcap or .db3 files; several play on one clock", is_basic=True
     )
-    rate: float = setting(1.0, 0.01, 10000.0, "recorded seconds played per second")
-    start_s: float = setting(0.0, 0.0, 1e7, "begin this long after the first message [s]")
-    duration_s: float = setting(0.0, 0.0, 1e7, "play this much [s]; 0: to the end")
+    rate: float = setting(1.0, 0.01, 10000.0, "recorded seconds played per second", is_basic=True)
+    start_s: float = setting(
+        0.0, 0.0, 1e7, "begin this long after the first message [s]", is_basic=True
+    )
+    duration_s: float = setting(0.0, 0.0, 1e7, "play this much [s]; 0: to the end", is_basic=True)
     is_looping: bool = setting(False, doc="begin again at the end; /clock jumps back then")
     is_paused: bool = setting(False, doc="wait for ~/pause (data: false) before playing")
     clock_hz: float = setting(

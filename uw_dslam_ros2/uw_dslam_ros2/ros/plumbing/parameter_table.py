@@ -1,8 +1,10 @@
-"""Writes the tables of parameters into docs/interfaces.md, from the settings themselves.
+"""Writes the tables of parameters into the documentation, from the settings themselves.
 
-::
+docs/interfaces.md has the parameters that users have a reason to set, docs/parameters-expert.md
+all others::
 
-    ./uw python -m uw_dslam_ros2.ros.plumbing.parameter_table docs/interfaces.md
+    ./uw python -m uw_dslam_ros2.ros.plumbing.parameter_table docs/interfaces.md \
+        docs/parameters-expert.md
 """
 
 from __future__ import annotations
@@ -34,20 +36,25 @@ GROUPS: dict[str, tuple[tuple[str, type[Config]], ...]] = {
 }
 """Groups of parameters of each node, beside its own."""
 
-_BEGIN = "<!-- parameters: written by uw_dslam_ros2.ros.plumbing.parameter_table -->"
+_BEGIN = "<!-- {} parameters: written by uw_dslam_ros2.ros.plumbing.parameter_table -->"
 _END = "<!-- end of parameters -->"
 
 
-def parameter_tables() -> str:
-    """Tables of all parameters of all nodes, in Markdown."""
+def parameter_tables(*, is_basic: bool) -> str:
+    """Tables of the parameters of all nodes, in Markdown: the basic ones, or all others."""
     parts = []
     for node, own in NODE_CONFIGS.items():
-        rows = [_row(*item) for item in settings_of(own)]
+        items = list(settings_of(own))
         for prefix, config_type in GROUPS[node]:
-            rows += [_row(*item) for item in settings_of(config_type, prefix)]
+            items += settings_of(config_type, prefix)
+        rows = [_row(*item) for item in items if _is_basic(item[2]) == is_basic]
         header = "| parameter | type | default | range | meaning |\n|---|---|---|---|---|"
         parts.append(f"### {node}\n\n{header}\n" + "\n".join(rows))
     return "\n\n".join(parts)
+
+
+def _is_basic(field: dataclasses.Field[Any]) -> bool:
+    return bool(field.metadata.get("is_basic", False))
 
 
 def _row(name: str, config_type: type[Config], field: dataclasses.Field[Any]) -> str:
@@ -78,17 +85,23 @@ def with_tables(text: str) -> str:
     DataError
         If the page has no place for them.
     """
-    head, begin, rest = text.partition(_BEGIN)
-    _, end, tail = rest.partition(_END)
-    if not begin or not end:
-        raise DataError(f"no place for the tables: expected a line {_BEGIN!r} and one {_END!r}")
-    return f"{head}{_BEGIN}\n\n{parameter_tables()}\n\n{_END}{tail}"
+    for kind in ("basic", "expert"):
+        begin = _BEGIN.format(kind)
+        head, found, rest = text.partition(begin)
+        _, end, tail = rest.partition(_END)
+        if found and end:
+            tables = parameter_tables(is_basic=kind == "basic")
+            return f"{head}{begin}\n\n{tables}\n\n{_END}{tail}"
+    raise DataError(
+        f"no place for the tables: expected a line {_BEGIN.format('basic')!r} and one {_END!r}"
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Renew the tables of the page that is named."""
-    path = Path((sys.argv[1:] if argv is None else argv)[0])
-    path.write_text(with_tables(path.read_text()))
+    """Renew the tables of the pages that are named."""
+    for name in sys.argv[1:] if argv is None else argv:
+        path = Path(name)
+        path.write_text(with_tables(path.read_text()))
     return 0
 
 

@@ -27,9 +27,13 @@ class GridRegistrationConfig(Config):
     max_side_cells: int = setting(8000, 100, 100000, "maps with a longer side are refused")
     gap: float = setting(0.1, 0.001, 0.5, "relative gap of the certificate")
     max_boxes: int = setting(200_000, 1000, 1_000_000_000, "boxes before the proof is given up")
-    max_seconds: float = setting(20.0, 0.1, 3600.0, "time for the proof [s]; needs a clock")
+    max_seconds: float = setting(
+        20.0, 0.1, 3600.0, "time for the proof [s]; needs a clock", is_basic=True
+    )
     is_proof_required: bool = setting(
-        False, doc="refuse a match, however probable, that is not the proven optimum to the gap"
+        False,
+        doc="refuse a match, however probable, that is not the proven optimum to the gap",
+        is_basic=True,
     )
     min_wall_cells: int = setting(25, 1, 100000, "fewer wall cells in a map are too few")
     min_overlap: float = setting(0.1, 0.0, 1.0, "least common seen area, share of the smaller")
@@ -40,4 +44,6 @@ class GridRegistrationConfig(Config):
     max_slide_share: float = setting(
         0.85, 0.1, 1.0, "score ten cells off in the weakest direction; a straight wall keeps it"
     )
-    min_probability: float = setting(0.75, 0.0, 1.0, "least probability of an accepted match")
+    min_probability: float = setting(
+        0.75, 0.0, 1.0, "least probability of an accepted match", is_basic=True
+    )
