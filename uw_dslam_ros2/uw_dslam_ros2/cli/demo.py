@@ -105,16 +105,19 @@ class _Steps:
     _last: str = ""
 
     def begin(self, name: str, text: str) -> None:
+        """A step begins, and with it the last one ends."""
         self.end()
         self._last, self._begun_s = name, time.monotonic()
         print(f"[demo] {len(self.times_s) + 1}/{_NUM_STEPS} {text}", flush=True)
 
     def end(self) -> None:
+        """Note the time of the step that ends."""
         if self._last:
             self.times_s[self._last] = time.monotonic() - self._begun_s
             self._last = ""
 
     def say(self, text: str) -> None:
+        """A line below the step."""
         print(f"[demo]     {text}", flush=True)
 
 

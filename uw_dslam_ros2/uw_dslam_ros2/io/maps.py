@@ -158,6 +158,7 @@ class _MapHeader:
 
     @classmethod
     def read(cls, path: Path) -> _MapHeader:
+        """From a map_server YAML file; raises `DataError` naming file, key and value."""
         try:
             content = yaml.safe_load(path.read_text(encoding="utf-8"))
         except OSError as error:

@@ -55,6 +55,7 @@ class _Graph(SubmapGraph):
         self._config = config
 
     def settle(self, sections: list[ClosedSection]) -> None:
+        """Look for loops of the newest submap, if that is asked for."""
         if self._config.estimator == "scan_matching" and self._config.loop.is_enabled:
             find_loops(self, sections, self._config)
 

@@ -270,29 +270,35 @@ class _Lags:
         self._heard_ns: dict[str, int] = {}
 
     def clear(self) -> None:
+        """Forget all: the recording begins again."""
         with self._changed:
             for table in (self._first_ns, self._sent_ns, self._heard_ns):
                 table.clear()
 
     def sent(self, vehicle: str, stamp_ns: int) -> None:
+        """Note the stamp of what was last played of a vehicle."""
         with self._changed:
             self._first_ns.setdefault(vehicle, stamp_ns)
             self._sent_ns[vehicle] = stamp_ns
 
     def heard(self, vehicle: str, stamp_ns: int) -> None:
+        """Note the stamp up to which a vehicle is mapped."""
         with self._changed:
             self._heard_ns[vehicle] = stamp_ns
             self._changed.notify_all()
 
     def forgive(self, vehicle: str) -> None:
+        """Take a vehicle as caught up, since it has not moved for too long."""
         with self._changed:
             self._heard_ns[vehicle] = self._sent_ns[vehicle]
 
     def wait(self, timeout_s: float) -> None:
+        """Until a vehicle is heard of, or the time is over."""
         with self._changed:
             self._changed.wait(timeout_s)
 
     def is_behind(self, vehicle: str) -> bool:
+        """Whether a vehicle is mapped less far than the limit allows."""
         with self._changed:
             if self._max_lag_ns == 0 or vehicle not in self._sent_ns or not vehicle:
                 return False

@@ -325,14 +325,17 @@ class _Statistics:
         self._latencies_s: deque[float] = deque(maxlen=_NUM_LATENCIES)
 
     def count(self, outcome: str) -> None:
+        """One more request that ended like this."""
         with self._lock:
             self._outcomes[outcome] += 1
 
     def add_latency(self, seconds: float) -> None:
+        """Note how long a request took."""
         with self._lock:
             self._latencies_s.append(seconds)
 
     def values(self) -> dict[str, float | int | str]:
+        """For the diagnostics, by name."""
         with self._lock:
             values: dict[str, float | int | str] = {
                 f"num_{outcome}": count for outcome, count in sorted(self._outcomes.items())
