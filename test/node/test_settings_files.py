@@ -72,6 +72,8 @@ def test_value_of_a_file_reaches_the_node(start, tmp_path):
         ("mapper: {occupancy: {resolution: 0.1}}", "mapper.occupancy.resolution is unknown"),
         ("mapper: {occupancy: {resolution_m: 1}}", "write 1.0"),
         ("mapper: {occupancy: {resolution_m: -1.0}}", "resolution_m is -1.0, expected 0.01 to"),
+        ("mapper: {match: {min_points: 9}}", "min_points is no setting any more; it is always 20"),
+        ("ping_queue: 50", "ping_queue is no setting any more; it is always 100"),
         ("inputt: points", "inputt is unknown to sonar_mapper; did you mean input"),
     ],
 )

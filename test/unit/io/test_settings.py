@@ -9,7 +9,9 @@ import pytest
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.io.settings import SettingsFile
+from uw_dslam_ros2.core.mapping import VehicleMapperConfig
+from uw_dslam_ros2.core.merging import MapQueueConfig
+from uw_dslam_ros2.io.settings import REMOVED, SettingsFile
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,3 +113,20 @@ def test_what_is_wrong_is_said(tmp_path: Path, text: str, parts: list[str]) -> N
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot read .*nothing\.yaml: No such file"):
         SettingsFile(tmp_path / "nothing.yaml")
+
+
+def test_setting_of_an_earlier_version_is_refused_by_what_became_of_it(tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text("queue: {max_checks: 5}\n")
+    with pytest.raises(ConfigError, match=r"queue\.max_checks is no setting any more.*always 3"):
+        SettingsFile(path).section(MapQueueConfig, "queue", "/map_queue_manager")
+
+
+@pytest.mark.parametrize("name", sorted(REMOVED))
+def test_removed_settings_are_removed(name):
+    group, _, rest = name.partition(".")
+    settings = {"mapper": VehicleMapperConfig(), "queue": MapQueueConfig()}
+    inner = settings[group].to_dict() if rest else {}
+    for part in rest.split("."):
+        assert part not in inner or isinstance(inner[part], dict)
+        inner = inner.get(part, {})

@@ -143,7 +143,7 @@ def test_water_is_free_only_before_the_first_echo():
     found = detect(image(intensity), FIXED)
     assert found.free_range_m[0] == pytest.approx(3.95)
     # No echo says less than an echo does.
-    assert found.free_range_m[1] == pytest.approx(FIXED.no_echo_free_share * 10.0)
+    assert found.free_range_m[1] == pytest.approx(0.5 * 10.0)
 
 
 def test_a_lone_echo_that_the_filter_drops_still_ends_the_free_water():

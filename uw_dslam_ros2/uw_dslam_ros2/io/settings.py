@@ -25,10 +25,37 @@ import yaml
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError
 
-__all__ = ["NODES", "SECTIONS", "SettingsFile"]
+__all__ = ["NODES", "REMOVED", "SECTIONS", "SettingsFile"]
 
 SECTIONS = ("mapper", "registration", "points", "queue")
 """Groups of settings that are part of the core; everything else concerns a node alone."""
+
+REMOVED = {
+    "ping_queue": "it is always 100",
+    "sensor_queue": "it is always 5000",
+    "jump_back_s": "it is always 1 s",
+    "path_max_poses": "it is always 2000",
+    "mapper.sonar.no_echo_free_share": "it is always 0.5",
+    "mapper.occupancy.max_spread_m": "it is always 0.5 m",
+    "mapper.occupancy.min_motion_m": "it is always 0.1 m",
+    "mapper.occupancy.min_turn_rad": "it is always 0.02 rad",
+    "mapper.occupancy.min_interval_s": "it is always 1 s",
+    "mapper.match.min_points": "it is always 20",
+    "mapper.match.max_points": "it is always 300",
+    "mapper.match.min_overlap": "it is always 0.3",
+    "mapper.particles.min_effective_share": "it is always 0.5",
+    "mapper.particles.max_points": "it is always 250",
+    "queue.log_odds_max": "it is always 8",
+    "queue.num_neighbours": "it is always 1",
+    "queue.max_checks": "it is always 3",
+    "queue.part_length": "it is always 6",
+    "queue.max_part_searches": "it is always 4",
+    "queue.vague_cells": "it is always 2",
+    "queue.vague_share": "it is always 1",
+    "queue.inlier_probability": "it is always 0.99",
+    "queue.edge_sigma_cells": "it is always 0.25",
+}
+"""Settings of earlier versions, and what became of them."""
 
 NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
 _EVERY_NODE = "/**"
@@ -85,6 +112,7 @@ class _Loader(yaml.SafeLoader):
     """Refuses a key that is there twice: YAML would silently drop the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As the base class, but refuse keys that are there twice."""
         seen: set[Any] = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
@@ -206,6 +234,11 @@ def _check_types(label: str, name: str, config_type: type[Config], values: Any) 
     """What rclpy would refuse is refused here too, so that a file is right or wrong for both."""
     for key, value in _mapping(label, name, values).items():
         field = next((field for field in fields(config_type) if field.name == key), None)
+        if field is None and f"{name}.{key}" in REMOVED:
+            raise ConfigError(
+                f"{label}: {name}.{key} is no setting any more; {REMOVED[f'{name}.{key}']}: "
+                "leave it out"
+            )
         if field is None:
             known = [field.name for field in fields(config_type)]
             raise ConfigError(

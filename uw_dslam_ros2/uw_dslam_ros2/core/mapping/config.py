@@ -34,10 +34,6 @@ class OccupancyConfig(Config):
         0.15, 0.0, 10.0, "water this close before an echo stays unknown [m]"
     )
     free_range_max_m: float = setting(30.0, 0.1, 1e4, "no free water is seen farther away [m]")
-    max_spread_m: float = setting(0.5, 0.01, 10.0, "largest half width of an echo across the beam")
-    min_motion_m: float = setting(0.1, 0.0, 10.0, "a ping enters the map after this way ...")
-    min_turn_rad: float = setting(0.02, 0.0, 3.2, "... or this turn ...")
-    min_interval_s: float = setting(1.0, 0.0, 1e4, "... or this time, whichever comes first")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +67,6 @@ class MatchConfig(Config):
     local_length_m: float = setting(
         15.0, 0.1, 1e4, "path length whose echoes a ping is matched against [m]"
     )
-    min_points: int = setting(20, 3, 100000, "fewer echoes are not matched")
-    max_points: int = setting(300, 10, 100000, "of more echoes an even choice is matched")
-    min_overlap: float = setting(0.3, 0.0, 1.0, "share of the echoes that must meet known ones")
     information_share: float = setting(
         0.1, 0.001, 1.0, "independent information per echo: neighbouring echoes err together"
     )
@@ -110,10 +103,6 @@ class ParticleConfig(Config):
     """The particle filter; where it looks for known submaps the settings of loops say."""
 
     num_particles: int = setting(60, 2, 10000, "particles")
-    min_effective_share: float = setting(
-        0.5, 0.0, 1.0, "resampling where the effective number falls below this share"
-    )
-    max_points: int = setting(250, 10, 100000, "points of a submap that are matched")
     seed: int = setting(0, 0, 2**31 - 1, "same seed and same messages, same map")
 
 

@@ -15,6 +15,10 @@ __all__ = ["LocalMap"]
 
 FloatArray = NDArray[np.float64]
 _COARSEST = 8.0
+_MIN_POINTS = 20
+"""Fewer echoes than this, of the ping or known ones, say too little of a pose."""
+_MAX_POINTS = 300
+"""Of more echoes an even choice is matched: more of the same walls add time, not accuracy."""
 
 
 class LocalMap:
@@ -44,11 +48,11 @@ class LocalMap:
     def match(self, points: FloatArray, weight: FloatArray, prior: Prior) -> Match | None:
         """Match a ping's echoes (N, 2) in base_link; None where there is too little to match."""
         config = self._config
-        if len(points) < config.min_points or not self._pings:
+        if len(points) < _MIN_POINTS or not self._pings:
             return None
         known = np.vstack([p for p, _, _ in self._pings])
         support = np.concatenate([w for _, w, _ in self._pings])
-        if len(known) < config.min_points:
+        if len(known) < _MIN_POINTS:
             return None
         sigma = np.sqrt(np.diag(prior.covariance))
         half_width = (
@@ -62,7 +66,7 @@ class LocalMap:
             sigmas.append(max(0.5 * sigmas[-1], config.sigma_m))
         fields = [LikelihoodField(known, support, s) for s in sigmas]
         source, source_weight = thin(points, weight, config.sigma_m)
-        stride = -(-len(source) // config.max_points)
+        stride = -(-len(source) // _MAX_POINTS)
         source, source_weight = source[::stride], source_weight[::stride]
         return match_points(
             fields,

@@ -22,6 +22,9 @@ UNITS_PER_NAT = 1000.0
 """Evidence is counted in integers of a thousandth of a nat, so that sums are exact in any
 order."""
 
+_MAX_SPREAD_M = 0.5
+"""Largest half width of an echo across the beam: far off, a wide one would paint whole arcs."""
+
 # Growing means copying everything, so it goes in long steps.
 _TILE = 256
 
@@ -142,7 +145,7 @@ class GrowingGrid:
             self._evidence, self._observed, self._scratch, self._row, self._col,
             config.resolution_m, T_frame_sonar.x, T_frame_sonar.y, T_frame_sonar.yaw,
             detections.points, detections.weight,
-            detections.range_sigma_m, detections.beamwidth_rad, config.max_spread_m,
+            detections.range_sigma_m, detections.beamwidth_rad, _MAX_SPREAD_M,
             beams, free_range,
             config.hit_log_odds * UNITS_PER_NAT, round(config.free_log_odds * UNITS_PER_NAT),
         )  # fmt: skip
@@ -157,7 +160,7 @@ class GrowingGrid:
     def _grow_for(self, detections: Detections, T_frame_sonar: SE2, reach_m: float) -> None:
         config = self._config
         points = T_frame_sonar.apply(detections.points)
-        margin = 2.0 * (config.max_spread_m + detections.range_sigma_m) + config.resolution_m
+        margin = 2.0 * (_MAX_SPREAD_M + detections.range_sigma_m) + config.resolution_m
         here = np.array([[T_frame_sonar.x, T_frame_sonar.y]])
         low = np.vstack([points - margin, here - reach_m]).min(axis=0)
         high = np.vstack([points + margin, here + reach_m]).max(axis=0)

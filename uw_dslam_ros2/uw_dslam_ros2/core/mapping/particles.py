@@ -19,6 +19,10 @@ from uw_dslam_ros2.core.se2 import SE2
 __all__ = ["ParticleFilter"]
 
 FloatArray = NDArray[np.float64]
+_MIN_EFFECTIVE_SHARE = 0.5
+"""Resampling where the effective number of particles falls below this share of all."""
+_MAX_POINTS = 250
+"""Points of a submap that are matched, for each particle."""
 _FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 
 
@@ -164,7 +168,7 @@ class ParticleFilter:
         )
         fields = [LikelihoodField(points, weight, s) for s in (2.0 * fine, fine)]
         source, support = thin(newest.points, 1.0 - np.exp(-newest.weight), fine)
-        stride = max(1, -(-len(source) // config.particles.max_points))
+        stride = max(1, -(-len(source) // _MAX_POINTS))
         match = match_points(
             fields, source[::stride], support[::stride], Prior(step, covariance), half_width,
             config.match.information_share,
@@ -191,7 +195,7 @@ class ParticleFilter:
         """Low-variance resampling where the effective number of particles has fallen too far."""
         weights = self.weights
         count = len(weights)
-        if 1.0 / float((weights**2).sum()) >= self._config.particles.min_effective_share * count:
+        if 1.0 / float((weights**2).sum()) >= _MIN_EFFECTIVE_SHARE * count:
             return
         places = (np.arange(count) + self._rng.random()) / count
         chosen = np.minimum(np.searchsorted(np.cumsum(weights), places), count - 1)

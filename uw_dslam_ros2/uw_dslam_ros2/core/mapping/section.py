@@ -19,6 +19,11 @@ __all__ = ["ClosedSection", "OpenSection"]
 
 FloatArray = NDArray[np.float64]
 
+_MIN_MOTION_M, _MIN_TURN_RAD, _MIN_INTERVAL_S = 0.1, 0.02, 1.0
+"""A ping enters the grid after this path length, turn or time, whichever comes first: pings of
+one place repeat one another's errors, and a vehicle at rest would be ever more sure of them.
+"""
+
 
 @dataclass(slots=True, eq=False)
 class ClosedSection:
@@ -140,11 +145,10 @@ class OpenSection:
     def _is_due(self, stamp_ns: int, T_submap_base: SE2) -> bool:
         if self._last_mapped is None:
             return True
-        config = self._config.occupancy
         last_ns, last = self._last_mapped
         distance, turn = last.distance_to(T_submap_base)
         return (
-            distance >= config.min_motion_m
-            or turn >= config.min_turn_rad
-            or (stamp_ns - last_ns) * 1e-9 >= config.min_interval_s
+            distance >= _MIN_MOTION_M
+            or turn >= _MIN_TURN_RAD
+            or (stamp_ns - last_ns) * 1e-9 >= _MIN_INTERVAL_S
         )

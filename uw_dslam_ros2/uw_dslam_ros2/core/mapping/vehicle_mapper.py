@@ -32,6 +32,9 @@ __all__ = ["VehicleMapper"]
 
 FloatArray = NDArray[np.float64]
 _REISSUE_M, _REISSUE_RAD = 0.02, 0.002
+"""A submap that moved by more is given away again."""
+_MIN_OVERLAP = 0.3
+"""Least share of a ping's echoes that must meet known ones for a match to be believed."""
 
 
 class VehicleMapper:
@@ -348,7 +351,7 @@ class VehicleMapper:
         match = self._local_map.match(points, detections.weight, prior)
         if match is not None:
             self._counts["match_overlap_last"] = match.overlap
-            if match.overlap >= self._config.match.min_overlap:
+            if match.overlap >= _MIN_OVERLAP:
                 self._count("num_matches")
                 self._navigation.add_fix(stamp_ns, match.T_target_source, match.information)
                 T_submap_base, _ = self._navigation.relative_at(stamp_ns)

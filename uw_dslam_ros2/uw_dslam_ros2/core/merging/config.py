@@ -1,4 +1,4 @@
-"""Settings of the map queue."""
+"""Settings of the map queue, and constants that its parts share."""
 
 from __future__ import annotations
 
@@ -6,7 +6,29 @@ from dataclasses import dataclass
 
 from uw_dslam_ros2.core.config import Config, setting
 
-__all__ = ["MapQueueConfig"]
+__all__ = [
+    "INLIER_PROBABILITY",
+    "LOG_ODDS_MAX",
+    "MAX_CHECKS",
+    "NUM_NEIGHBOURS",
+    "VAGUE_CELLS",
+    "MapQueueConfig",
+]
+
+NUM_NEIGHBOURS = 1
+"""Submaps on each side that one is matched with in a check: a single one shares too little."""
+MAX_CHECKS = 3
+"""Checks of an accepted match, at different places: two may fail by chance, three rarely do."""
+VAGUE_CELLS = 2.0
+"""Places that saw the same are matched where they are less sure of each other [cells]: what is
+surer than that does not show in the map.
+"""
+LOG_ODDS_MAX = 8.0
+"""Limit of the log-odds of merged cells: twice that of a vehicle's own map, so that two that
+agree are surer than one, and a third can still change it.
+"""
+INLIER_PROBABILITY = 0.99
+"""Share of right edges that the chi-square test of an edge keeps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,40 +52,15 @@ class MapQueueConfig(Config):
         "cell size of the global map [m]; 0: that of the pinning submap",
         is_basic=True,
     )
-    log_odds_max: float = setting(8.0, 0.5, 50.0, "limit of the global map's log-odds")
     max_submap_cells: int = setting(
         16_000_000, 1, 2_000_000_000, "largest submap grid taken [cells]"
     )
     max_partners: int = setting(
         4, 1, 1000, "vehicles that each vehicle is matched with at first, most promising first"
     )
-    num_neighbours: int = setting(
-        1, 0, 100, "neighbours on each side that a submap is matched with in a check"
-    )
-    max_checks: int = setting(
-        3, 0, 100, "checks of an accepted match, at different places of the common area"
-    )
-    part_length: int = setting(
-        6, 2, 1000, "consecutive submaps in a part of a vehicle's map that is matched by itself"
-    )
-    max_part_searches: int = setting(
-        4, 1, 1000, "searches between two components by their most promising parts"
-    )
-    vague_cells: float = setting(
-        2.0, 0.1, 1e6, "places that saw the same are matched if less sure of each other [cells]"
-    )
-    vague_share: float = setting(
-        1.0, 0.0, 100.0, "at most so many such matches for each submap, on average"
-    )
     growth: float = setting(
         1.5,
         1.0,
         100.0,
         "while maps grow, refused ones are matched again when larger by this factor",
-    )
-    inlier_probability: float = setting(
-        0.99, 0.5, 0.999999, "share of right edges that the chi-square test of an edge keeps"
-    )
-    edge_sigma_cells: float = setting(
-        0.25, 0.0, 100.0, "least standard deviation believed of a registration [cells]"
     )

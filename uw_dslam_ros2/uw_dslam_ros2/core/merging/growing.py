@@ -23,7 +23,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
-from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.config import NUM_NEIGHBOURS, VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers, most_promising
@@ -59,7 +59,7 @@ class _GrowingPlanner:
         config: MapQueueConfig,
     ) -> None:
         self._library, self._anchor, self._config = library, anchor, config
-        self._verifier = Verifier(library, answers, config, is_lenient=True)
+        self._verifier = Verifier(library, answers, is_lenient=True)
         self._standing = [
             answers[key]
             for key in sorted(standing)
@@ -68,6 +68,7 @@ class _GrowingPlanner:
         self._claims = _claims(library, answers.values())
 
     def run(self) -> Plan:
+        """Work the plan out; the steps of the module's description."""
         joints = [self._verifier.joint(answer) for answer in self._standing]
         settled, components = self._settle(joints)
         for pair in self._apart(components):
@@ -82,7 +83,7 @@ class _GrowingPlanner:
         return Plan(wanted, settled, self._library.odometry.edges, components)
 
     def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
-        return self._library.settle(self._anchor, joints, self._config.inlier_probability)
+        return self._library.settle(self._anchor, joints)
 
     def _apart(self, components: Sequence[Component]) -> list[Pair]:
         """The best pairs of vehicles of different components, the most promising first."""
@@ -130,13 +131,13 @@ class _GrowingPlanner:
     def _tie_newest(self, component: Component, joints: Sequence[Joint]) -> list[Joint]:
         """Step 4: the newest place of each vehicle whose neighbours are there."""
         side = self._library.component_side(component)
-        reach = self._config.num_neighbours
+        reach = NUM_NEIGHBOURS
         newest = set()
         for vehicle in {submap_id[0] for submap_id in side.T_frame_submap}:
             ids = self._library.closed(vehicle)
             newest.add(ids[max(0, len(ids) - 1 - reach)])
         inliers = [joint for joint in joints if joint.is_inlier]
-        vague_cells = self._config.growth * self._config.vague_cells
+        vague_cells = self._config.growth * VAGUE_CELLS
         return self._verifier.joints_where_vague(side, inliers, vague_cells, 1, newest)
 
 

@@ -17,8 +17,13 @@ __all__ = ["joint_of"]
 
 FloatArray = NDArray[np.float64]
 
+_EDGE_SIGMA_CELLS = 0.25
+"""Least standard deviation believed of a registration: walls are drawn into cells, which no
+residual shows.
+"""
 
-def joint_of(library: Library, answer: Answer, edge_sigma_cells: float) -> Joint:
+
+def joint_of(library: Library, answer: Answer) -> Joint:
     """The edge of an answer, between the two submaps that share most.
 
     Parameters
@@ -27,8 +32,6 @@ def joint_of(library: Library, answer: Answer, edge_sigma_cells: float) -> Joint
         All submaps.
     answer
         With a transform that means something.
-    edge_sigma_cells
-        Least standard deviation believed of a registration, in cells.
     """
     source, target = answer.match.source, answer.match.target
     T_target_source = answer.T_target_source
@@ -40,7 +43,7 @@ def joint_of(library: Library, answer: Answer, edge_sigma_cells: float) -> Joint
         left @ T_target_source @ right,
         compose_covariance(answer.covariance, left, T_target_source, right),
     )
-    covariance = edge.covariance + _distrust(library, source, target, edge, edge_sigma_cells)
+    covariance = edge.covariance + _distrust(library, source, target, edge)
     edge = Edge(edge.source, edge.target, edge.T_target_source, covariance)
     return Joint(answer.match.key, edge, answer.probability, is_unsure=not answer.is_accepted)
 
@@ -59,11 +62,9 @@ def _ends(
     return best[1], best[2]
 
 
-def _distrust(
-    library: Library, source: Unit, target: Unit, edge: Edge, edge_sigma_cells: float
-) -> FloatArray:
+def _distrust(library: Library, source: Unit, target: Unit, edge: Edge) -> FloatArray:
     """Covariance (3, 3) that a registration cannot know of: the cells, and bent maps."""
-    cell_m = edge_sigma_cells * library.submaps[edge.target].submap.grid.spec.resolution_m
+    cell_m = _EDGE_SIGMA_CELLS * library.submaps[edge.target].submap.grid.spec.resolution_m
     radius_m = min(library.submaps[i].radius_m for i in (edge.source, edge.target))
     cell_rad = cell_m / max(radius_m, cell_m)
     floor = np.diag([cell_m**2, cell_m**2, cell_rad**2])

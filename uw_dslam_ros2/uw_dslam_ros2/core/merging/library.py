@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging.answers import Match
+from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, LOG_ODDS_MAX, NUM_NEIGHBOURS
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.descriptors import MapShape, shape_of
 from uw_dslam_ros2.core.merging.odometry import Odometry
@@ -26,7 +27,8 @@ Memory = dict[Hashable, Any]
 """Results by what they depend on; may be thrown away at any time."""
 
 _GROWTH = 1.5
-_UNIT_LOG_ODDS_MAX = 8.0
+_PART_LENGTH = 6
+"""Consecutive submaps in a part of a vehicle's map that is matched by itself."""
 _MAX_MEMORY = 200_000
 
 
@@ -59,13 +61,10 @@ class Library:
         submaps: Mapping[SubmapId, StoredSubmap],
         withdrawn: frozenset[SubmapId],
         memory: Memory,
-        num_neighbours: int,
-        part_length: int,
     ) -> None:
         self.submaps = submaps
         self.odometry = Odometry(submaps)
         self._memory = memory
-        self._num_neighbours, self._part_length = num_neighbours, part_length
         if len(memory) > _MAX_MEMORY:
             memory.clear()
         self.active = {
@@ -105,7 +104,7 @@ class Library:
         """A submap with its neighbours in its vehicle's sequence."""
         ids = self.closed(submap_id[0])
         index = ids.index(submap_id)
-        reach = self._num_neighbours if len(ids) > 2 * self._num_neighbours + 1 else 0
+        reach = NUM_NEIGHBOURS if len(ids) > 2 * NUM_NEIGHBOURS + 1 else 0
         low, high = max(0, index - reach), index + reach + 1
         return self._odometry_unit(ids[low:high], submap_id)
 
@@ -114,7 +113,7 @@ class Library:
         units: list[Unit] = []
         for vehicle in sorted({submap_id[0] for submap_id in side.T_frame_submap}):
             ids = self.closed(vehicle)
-            length = min(self._part_length, -(-len(ids) // 2))
+            length = min(_PART_LENGTH, -(-len(ids) // 2))
             stride = max(1, length // 2)
             last = len(ids) - length
             for start in sorted({*range(0, last, stride), last}):
@@ -160,7 +159,7 @@ class Library:
 
     def render(self, unit: Unit) -> OccupancyMap:
         """The unit's map; not remembered, for its size."""
-        occupancy = render_unit(unit, self.submaps, _UNIT_LOG_ODDS_MAX)
+        occupancy = render_unit(unit, self.submaps, LOG_ODDS_MAX)
         assert occupancy is not None, "active submaps hold something"
         return occupancy
 
@@ -183,7 +182,7 @@ class Library:
         return self._remember(key, lambda: shared_area_m2(first, second, T_target_source))
 
     def settle(
-        self, anchor: SubmapId, joints: Sequence[Joint], inlier_probability: float
+        self, anchor: SubmapId, joints: Sequence[Joint]
     ) -> tuple[list[Joint], list[Component]]:
         """Solve the pose graph; see `settling.settle`."""
         # One answer may serve several matches; it is one edge.
@@ -191,7 +190,7 @@ class Library:
         key = ("graph", self._state, anchor, tuple(sorted(unique)))
         edges, own = self.odometry.edges, list(unique.values())
         return self._remember(
-            key, lambda: settle(self.submaps, anchor, edges, own, inlier_probability)
+            key, lambda: settle(self.submaps, anchor, edges, own, INLIER_PROBABILITY)
         )
 
     def _odometry_unit(self, ids: Sequence[SubmapId], reference: SubmapId | None = None) -> Unit:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
-from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan
@@ -26,7 +25,6 @@ def make_pairwise_plan(
     vehicles: Sequence[str],
     answers: Mapping[MatchKey, Answer],
     anchor: SubmapId,
-    config: MapQueueConfig,
     *,
     is_growing: bool = False,
 ) -> Plan:
@@ -45,13 +43,11 @@ def make_pairwise_plan(
         By the key of the question.
     anchor
         The submap that the global frame is pinned to.
-    config
-        Settings.
     is_growing
         More submaps are expected: match each vehicle's first 1, 2, 4, 8, ... submaps, so that not
         each new one asks everything anew.
     """
-    verifier = Verifier(library, answers, config)
+    verifier = Verifier(library, answers)
     queue = [_vehicle_map(library, vehicle) for vehicle in vehicles]
     idle = [c for c in queue if not library.component_side(c).T_frame_submap]
     queue = [component for component in queue if component not in idle]

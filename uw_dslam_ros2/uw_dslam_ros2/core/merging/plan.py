@@ -26,7 +26,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
-from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.config import VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.graph import Edge
@@ -37,6 +37,9 @@ from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["Plan", "component_numbers", "make_plan", "most_promising"]
+
+_MAX_PART_SEARCHES = 4
+"""Searches between two components by their most promising parts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,10 +92,11 @@ class _Planner:
     ) -> None:
         self._library, self._config, self._anchor = library, config, anchor
         self._answers, self._standing = answers, standing
-        self._verifier = Verifier(library, answers, config)
+        self._verifier = Verifier(library, answers)
         self._units = library.whole_units()
 
     def run(self) -> Plan:
+        """Work the plan out; the steps of the module's description."""
         ranked = self._ranked(self._units)
         first = most_promising(ranked, self._config.max_partners)
         joints = self._match_vehicles(first)
@@ -175,7 +179,7 @@ class _Planner:
             seen.add(units)
             ends = frozenset((min(source_side.T_frame_submap), min(target_side.T_frame_submap)))
             taken[ends] = taken.get(ends, 0) + 1
-            if taken[ends] <= self._config.max_part_searches:
+            if taken[ends] <= _MAX_PART_SEARCHES:
                 found += self._verifier.joints_of(match, source_side, target_side)
         return found
 
@@ -186,10 +190,10 @@ class _Planner:
         found: list[Joint] = []
         for component in components:
             side = self._library.component_side(component)
-            limit = round(self._config.vague_share * len(side.T_frame_submap))
-            found += self._verifier.joints_where_vague(
-                side, inliers, self._config.vague_cells, limit
-            )
+            limit = len(
+                side.T_frame_submap
+            )  # one for each submap, so that time grows with their number
+            found += self._verifier.joints_where_vague(side, inliers, VAGUE_CELLS, limit)
         return found
 
     def _between(
@@ -242,7 +246,7 @@ class _Planner:
         return key
 
     def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
-        return self._library.settle(self._anchor, joints, self._config.inlier_probability)
+        return self._library.settle(self._anchor, joints)
 
 
 def most_promising(ranked: Sequence[tuple[str, str]], max_partners: int) -> list[tuple[str, str]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, numbers_of
-from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Window
 from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
 from uw_dslam_ros2.core.merging.growing import make_growing_plan
@@ -280,8 +280,6 @@ class MapQueue:
                 self._submaps,
                 frozenset(self._withdrawn),
                 self._memory,
-                self._config.num_neighbours,
-                self._config.part_length,
             )
         return self._library
 
@@ -302,7 +300,6 @@ class MapQueue:
                     self._vehicles,
                     self._answers,
                     anchor,
-                    self._config,
                     is_growing=self._is_growing,
                 )
             else:
@@ -359,7 +356,7 @@ class MapQueue:
         if self._lattice is None:
             return None
         if self._global_map is None:
-            self._global_map = GlobalMap(self._lattice, self._config.log_odds_max)
+            self._global_map = GlobalMap(self._lattice, LOG_ODDS_MAX)
         if not self._is_drawn:
             shown = {i: T for i, T in merged.items() if i not in self._withdrawn}
             self._global_map.draw(self._submaps, shown)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.merging.answers import Answer, AnswerBook, Match, MatchKey
-from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, MAX_CHECKS, NUM_NEIGHBOURS
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.graph import Edge, invert_covariance
 from uw_dslam_ros2.core.merging.joining import joint_of
@@ -52,11 +52,10 @@ class Verifier:
         self,
         library: Library,
         answers: Mapping[MatchKey, Answer],
-        config: MapQueueConfig,
         *,
         is_lenient: bool = False,
     ) -> None:
-        self._library, self._config = library, config
+        self._library = library
         self._book = AnswerBook(answers, is_lenient=is_lenient)
         self.wanted: dict[MatchKey, Match] = {}
         self.visited: set[MatchKey] = set()
@@ -86,7 +85,7 @@ class Verifier:
             # Two single submaps are all there is to ask about; otherwise they would have met.
             is_single = len(match.source.ids) == len(match.target.ids) == 1
             return [main.joint] if is_single and answer.is_accepted else []
-        step = self._config.max_checks
+        step = MAX_CHECKS
         for count in range(step, len(checks) + step, step):
             replies = self._ask_all(checks[:count])
             if replies is None:
@@ -99,7 +98,7 @@ class Verifier:
 
     def joints_nearby(self, source: Side, target: Side) -> list[Joint]:
         """Joints between two vehicles of one component, where the graph says that they meet."""
-        checks = self._checks(None, None, SE2(), source, target)[: self._config.max_checks]
+        checks = self._checks(None, None, SE2(), source, target)[:MAX_CHECKS]
         replies = self._ask_all(checks)
         if replies is None:
             return []
@@ -117,7 +116,7 @@ class Verifier:
         inside = [joint for joint in joints if joint.edge.source in side.T_frame_submap]
         edges = [joint.edge for joint in inside]
         places = vague_places(
-            self._library, side, edges, self._config.num_neighbours, vague_cells, limit, chosen
+            self._library, side, edges, NUM_NEIGHBOURS, vague_cells, limit, chosen
         )
         groups: dict[frozenset[str], list[Match]] = {}
         for ends, uncertainty in places:
@@ -141,7 +140,7 @@ class Verifier:
 
     def joint(self, answer: Answer) -> Joint:
         """The edge of an answer; see `joint_of`."""
-        return joint_of(self._library, answer, self._config.edge_sigma_cells)
+        return joint_of(self._library, answer)
 
     def ask(self, match: Match) -> Answer | None:
         """The answer, if there is one; otherwise the question is noted as wanted."""
@@ -168,8 +167,8 @@ class Verifier:
             T_target_source,
             source,
             target,
-            self._config.num_neighbours,
-            _NUM_ROUNDS * self._config.max_checks,
+            NUM_NEIGHBOURS,
+            _NUM_ROUNDS * MAX_CHECKS,
         )
         checks: list[Match] = []
         for source_id, target_id in places:
@@ -210,7 +209,7 @@ class Verifier:
     def _weigh(
         self, votes: Sequence[Vote], num_checks: int, source: Side, target: Side
     ) -> tuple[list[Joint], float]:
-        return weigh(votes, num_checks, source, target, self._config.inlier_probability)
+        return weigh(votes, num_checks, source, target, INLIER_PROBABILITY)
 
     def _ask_all(self, matches: Sequence[Match]) -> list[Answer] | None:
         """All answers, or None while one is missing."""

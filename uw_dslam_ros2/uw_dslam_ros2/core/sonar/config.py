@@ -76,12 +76,6 @@ class SonarConfig(Config):
     range_sigma_m: float = setting(
         0.03, 0.0001, 10.0, "standard deviation of a range, at least (a bin adds its own) [m]"
     )
-    no_echo_free_share: float = setting(
-        0.5,
-        0.0,
-        1.0,
-        "a beam without any echo is free water up to this share of the largest range",
-    )
 
     def __post_init__(self) -> None:
         Config.__post_init__(self)

@@ -22,6 +22,10 @@ __all__ = ["detect", "detections_from_points", "detections_from_scan"]
 FloatArray = NDArray[np.float64]
 _MODES = {"first": 0, "strongest": 1, "all": 2}
 _MIN_WEIGHT = 0.1
+_NO_ECHO_FREE_SHARE = 0.5
+"""A beam that met nothing is free water only up to this share of its range: beyond, a weak
+reflector may have been missed.
+"""
 
 
 def detect(image: SonarImage, config: SonarConfig = SonarConfig()) -> Detections:  # noqa: B008 (frozen)
@@ -70,7 +74,7 @@ def detect(image: SonarImage, config: SonarConfig = SonarConfig()) -> Detections
     free_range_m = np.where(
         first_above >= 0,
         range_m[first + np.maximum(first_above, 0)] - 0.5 * bin_m,
-        config.no_echo_free_share * range_m[last - 1],
+        _NO_ECHO_FREE_SHARE * range_m[last - 1],
     )
     return Detections(
         image.stamp_ns,
@@ -93,7 +97,7 @@ def detections_from_scan(
     """Detections of a scan: angles (B,) and ranges (B,) in the sonar's frame.
 
     A range that is not finite, or not within the range gate and `range_max_m`, is no echo.
-    Infinity says that the beam met nothing, so the water is free for `no_echo_free_share` of
+    Infinity says that the beam met nothing, so the water is free for half of
     `range_max_m`; NaN says nothing.
     """
     bearing = np.asarray(angles_rad, dtype=np.float64)
@@ -115,7 +119,7 @@ def detections_from_scan(
     free = np.zeros(len(bearing))
     free[is_echo] = ranges[is_echo]
     met_nothing = (ranges >= limit) & ~np.isnan(ranges)
-    free[met_nothing] = config.no_echo_free_share * limit
+    free[met_nothing] = _NO_ECHO_FREE_SHARE * limit
     return Detections(
         stamp_ns,
         points[keep],

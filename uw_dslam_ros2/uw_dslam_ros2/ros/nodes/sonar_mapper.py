@@ -54,6 +54,8 @@ from uw_dslam_ros2.ros.plumbing.worker import Worker
 __all__ = ["SonarMapper", "SonarMapperConfig", "main"]
 
 _PINGS = (ImageEvent, ScanEvent, PointsEvent)
+_JUMP_BACK_S = 1.0  # stamps that go back by more begin a new recording
+_PATH_MAX_POSES = 2000  # a longer path is thinned when published
 _MAX_AHEAD_NS = 10_000_000_000
 _MOUNT_PATIENCE_NS = 5_000_000_000
 _ODOM_PERIOD_NS = 100_000_000
@@ -78,7 +80,7 @@ class SonarMapper(Node):
         self._base_frame = self._config.base_frame or f"{self._vehicle_id}/base_link"
         self._mapper = VehicleMapper(self._mapper_config, self._vehicle_id)
         self._order: StampOrder[SensorEvent] = StampOrder(
-            int(self._reorder_s() * 1e9), int(self._config.jump_back_s * 1e9)
+            int(self._reorder_s() * 1e9), int(_JUMP_BACK_S * 1e9)
         )
         self._counts: Counter[str] = Counter()
         self._mapper_values: dict[str, float | int | str] = {}
@@ -311,7 +313,7 @@ class SonarMapper(Node):
             occupancy = self._mapper.vehicle_map()
             self._map_pub.publish(occupancy_to_msg(occupancy, frame_id, stamp_ns))
             self._path_pub.publish(
-                path_to_msg(stamps_ns, poses, frame_id, stamp_ns, self._config.path_max_poses)
+                path_to_msg(stamps_ns, poses, frame_id, stamp_ns, _PATH_MAX_POSES)
             )
 
     # --- services and diagnostics ------------------------------------------------------------

@@ -50,21 +50,15 @@ class SonarMapperConfig(Config):
         doc="subscribe to sensors reliably: for replays, where nothing may be lost",
         is_basic=True,
     )
-    ping_queue: int = setting(100, 1, 100000, "pings kept while the mapper is busy")
-    sensor_queue: int = setting(5000, 1, 1000000, "other messages kept while the mapper is busy")
     reorder_s: float = setting(
         0.0,
         0.0,
         600.0,
         "a sensor is waited for this long, to use all in order [s]; 0: 1, or 60 if reliable",
     )
-    jump_back_s: float = setting(
-        1.0, 0.01, 1e6, "stamps that go back by more begin a new recording: all starts afresh [s]"
-    )
     map_period_s: float = setting(
         2.0, 0.1, 3600.0, "between two maps, by the pings' stamps and by a steady clock [s]"
     )
-    path_max_poses: int = setting(2000, 2, 1000000, "a longer path is thinned when published")
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.io.settings import SECTIONS
+from uw_dslam_ros2.io.settings import REMOVED, SECTIONS
 from uw_dslam_ros2.ros.plumbing.node_settings import names_of_all_nodes
 
 __all__ = ["declare_config", "refuse_unknown_parameters", "settings_of"]
@@ -122,6 +122,10 @@ def refuse_unknown_parameters(node: Node) -> None:
             or is_anothers
         ):
             continue
+        if name in REMOVED:
+            raise ConfigError(
+                f"parameter {name} is no setting any more; {REMOVED[name]}: leave it out"
+            )
         raise ConfigError(
             f"parameter {name} is unknown to {node.get_name()}; {_nearest(name, _declared(node))}"
         )

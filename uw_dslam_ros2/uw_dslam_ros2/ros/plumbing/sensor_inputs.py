@@ -24,6 +24,11 @@ from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 
 __all__ = ["SensorInput", "sensor_inputs"]
 
+_PING_QUEUE = 100
+"""Pings kept while the mapper is busy: ten seconds at 10 Hz, and an image is large."""
+_SENSOR_QUEUE = 5000
+"""Other messages kept meanwhile: half a minute of a fast IMU; nearly nothing in memory."""
+
 
 @dataclass(frozen=True, slots=True)
 class SensorInput:
@@ -45,10 +50,10 @@ def sensor_inputs(config: SonarMapperConfig, vehicle_id: str) -> tuple[SensorInp
     }[config.input]
     velocity_type = Dvl if config.velocity == "dvl" else TwistWithCovarianceStamped
     return (
-        SensorInput(ping_type, ping_topic, to_event, config.ping_queue),
-        SensorInput(velocity_type, "dvl", reader.velocity, config.sensor_queue),
-        SensorInput(Imu, "imu", reader.imu, config.sensor_queue),
-        SensorInput(FluidPressure, "depth", reader.depth, config.sensor_queue),
+        SensorInput(ping_type, ping_topic, to_event, _PING_QUEUE),
+        SensorInput(velocity_type, "dvl", reader.velocity, _SENSOR_QUEUE),
+        SensorInput(Imu, "imu", reader.imu, _SENSOR_QUEUE),
+        SensorInput(FluidPressure, "depth", reader.depth, _SENSOR_QUEUE),
     )
 
 
@@ -63,23 +68,29 @@ class _Reader:
         return self._vehicle_id, messages.stamp_of(msg), msg.header.frame_id
 
     def image(self, msg: Any) -> SensorEvent:
+        """A sonar image."""
         image = messages.sonar_image_of(msg, self._config.data_order)
         return ImageEvent(*self._key(msg), image)
 
     def scan(self, msg: Any) -> SensorEvent:
+        """Ranges over angles."""
         return ScanEvent(*self._key(msg), *messages.scan_of_laser_scan(msg))
 
     def points(self, msg: Any) -> SensorEvent:
+        """Echoes that somebody else found."""
         return PointsEvent(*self._key(msg), messages.points_of_cloud(msg))
 
     def imu(self, msg: Any) -> SensorEvent:
+        """Yaw and yaw rate."""
         return ImuEvent(*self._key(msg), *messages.yaw_of_imu(msg))
 
     def depth(self, msg: Any) -> SensorEvent:
+        """Pressure as depth."""
         depth_m = messages.depth_of_pressure(msg, self._config.water_density_kg_m3)
         return DepthEvent(*self._key(msg), depth_m)
 
     def velocity(self, msg: Any) -> SensorEvent | None:
+        """Velocity over ground; None without bottom lock."""
         is_dvl = self._config.velocity == "dvl"
         value = messages.velocity_of_dvl(msg) if is_dvl else messages.velocity_of_twist(msg)
         return None if value is None else VelocityEvent(*self._key(msg), *value)
