@@ -41,9 +41,9 @@ from uw_dslam_ros2.ros.convert.registration import (
     refused_registration,
     registration_from_msg,
 )
-from uw_dslam_ros2.ros.plumbing.arrivals import Arrivals
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
+from uw_dslam_ros2.ros.plumbing.idle_timeout import IdleTimeout
 from uw_dslam_ros2.ros.plumbing.map_publisher import MapPublisher
 from uw_dslam_ros2.ros.plumbing.node_settings import MapQueueManagerConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
@@ -51,7 +51,7 @@ from uw_dslam_ros2.ros.plumbing.qos import LATCHED, SUBMAPS
 from uw_dslam_ros2.ros.plumbing.queue_services import QueueServices, has_session
 from uw_dslam_ros2.ros.plumbing.registration_clients import RegistrationClients
 from uw_dslam_ros2.ros.plumbing.running import run_node
-from uw_dslam_ros2.ros.plumbing.sparing import Sparing
+from uw_dslam_ros2.ros.plumbing.throttle import Throttle
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["MapQueueManager", "MapQueueManagerConfig", "main"]
@@ -76,14 +76,14 @@ class MapQueueManager(Node):
         refuse_unknown_parameters(self)
         self._queue = MapQueue(self._queue_config)
         self._message = "waiting for submaps"
-        self._arrivals = Arrivals(self._config.quiet_s)
+        self._idle = IdleTimeout(self._config.quiet_s)
         self._counts: Counter[str] = Counter()
         self._values: dict[str, float | int | str] = {}
         self._asked: dict[int, MatchRequest] = {}
         self._is_changed = True
         self._is_saved = True
         # Drawing a large map takes a second: questions and answers come first.
-        self._drawing = Sparing(self._config.publish_period_s)
+        self._drawing = Throttle(self._config.publish_period_s)
         self._status_s = self._discovered_s = float("-inf")
         self._sent_transforms: tuple[Any, ...] = ()
         self._is_tick_posted = threading.Event()
@@ -174,7 +174,7 @@ class MapQueueManager(Node):
         if not is_new:
             self._counts["num_repeated"] += 1
             return
-        self._arrivals.note(time.monotonic())
+        self._idle.note(time.monotonic())
         self.changed(f"{submap.vehicle_id}/{submap.sequence} revision {submap.revision} received")
 
     def changed(self, message: str) -> None:
@@ -191,7 +191,7 @@ class MapQueueManager(Node):
             self._discover()
         for request_id, reason in self._servers.take_lost():
             self._ask_again(request_id, reason)
-        self._queue.is_growing = self._arrivals.is_growing(now_s)
+        self._queue.is_growing = self._idle.is_active(now_s)
         self._ask()
         # First saved, then told: what anybody has heard of outlives a kill.
         if not self._is_saved and self._config.session:
@@ -356,7 +356,7 @@ class MapQueueManager(Node):
 
     def settle(self) -> None:
         """No more submaps are expected: ask all that is left."""
-        self._arrivals.end()
+        self._idle.end()
         self._tick()
 
     def _resume(self, path: str) -> None:

@@ -34,8 +34,8 @@ from uw_dslam_ros2.ros.convert.core_types import (
     stamp_to_msg,
     submap_to_msg,
 )
+from uw_dslam_ros2.ros.plumbing.batched_subscription import subscribe_batched
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
-from uw_dslam_ros2.ros.plumbing.draining import subscribe_draining
 from uw_dslam_ros2.ros.plumbing.frames import (
     WARNING_PERIOD_S,
     FrameBroadcaster,
@@ -47,8 +47,8 @@ from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown
 from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
 from uw_dslam_ros2.ros.plumbing.running import run_node
 from uw_dslam_ros2.ros.plumbing.sensor_inputs import sensor_inputs
-from uw_dslam_ros2.ros.plumbing.sparing import Sparing
 from uw_dslam_ros2.ros.plumbing.stamp_order import StampOrder
+from uw_dslam_ros2.ros.plumbing.throttle import Throttle
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["SonarMapper", "SonarMapperConfig", "main"]
@@ -87,7 +87,7 @@ class SonarMapper(Node):
         self._last_problem = ""
         self._odom_stamp_ns = 0
         self._map_stamp_ns = 0
-        self._drawing = Sparing(self._config.map_period_s)
+        self._drawing = Throttle(self._config.map_period_s)
         self._is_finished = False
         self._heard_s = time.monotonic()
         self._worker = Worker("mapper", self._on_worker_error)
@@ -132,7 +132,7 @@ class SonarMapper(Node):
         for sensor in sensor_inputs(self._config, self._vehicle_id):
             take = functools.partial(self._on_message, sensor.topic, sensor.to_event)
             qos = sensor_qos(sensor.queue_depth, is_reliable=self._config.is_reliable)
-            subscribe_draining(self, sensor.msg_type, sensor.topic, take, qos, group)
+            subscribe_batched(self, sensor.msg_type, sensor.topic, take, qos, group)
             self._streams.append(sensor.topic)
             full_name = self.resolve_topic_name(sensor.topic)
             package = sensor.msg_type.__module__.split(".")[0]

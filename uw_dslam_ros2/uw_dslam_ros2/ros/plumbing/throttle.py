@@ -6,12 +6,12 @@ import contextlib
 import time
 from collections.abc import Iterator
 
-__all__ = ["Sparing"]
+__all__ = ["Throttle"]
 
 _SHARE = 0.1  # of the time that the work may take
 
 
-class Sparing:
+class Throttle:
     """Says when costly work is due: ``period_s`` after it was begun last, later if it is slow.
 
     By a steady clock, since a replay may be faster than time.

@@ -15,10 +15,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-__all__ = ["subscribe_draining"]
+__all__ = ["subscribe_batched"]
 
 
-def subscribe_draining(
+def subscribe_batched(
     node: Node,
     msg_type: Any,
     topic: str,

@@ -1,16 +1,16 @@
-"""Whether more submaps are to be expected soon, by how often they came so far."""
+"""When submaps have stopped coming, by how often they came so far."""
 
 from __future__ import annotations
 
 from collections import deque
 
-__all__ = ["Arrivals"]
+__all__ = ["IdleTimeout"]
 
 _LEAST_S, _MOST_S = 3.0, 120.0
 _NUM_GAPS = 12
 
 
-class Arrivals:
+class IdleTimeout:
     """Says when the vehicles have come to rest; times are those of a steady clock.
 
     Parameters
@@ -36,7 +36,7 @@ class Arrivals:
         """Somebody says that nothing more is expected."""
         self._is_ended = True
 
-    def is_growing(self, now_s: float) -> bool:
+    def is_active(self, now_s: float) -> bool:
         """Whether more is expected."""
         if self._is_ended or self._last_s is None:
             return False

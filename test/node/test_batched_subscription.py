@@ -1,4 +1,4 @@
-"""A draining subscription hands over every message, in order, few wake-ups a burst."""
+"""A batched subscription hands over every message, in order, few wake-ups a burst."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Int32
 
-from uw_dslam_ros2.ros.plumbing.draining import subscribe_draining
+from uw_dslam_ros2.ros.plumbing.batched_subscription import subscribe_batched
 
 pytestmark = pytest.mark.ros
 
@@ -23,7 +23,7 @@ def test_burst_arrives_whole_and_in_order(ros_context, max_at_once, spinning):
     sender = rclpy.create_node("sender", context=ros_context)
     reader = rclpy.create_node("reader", context=ros_context)
     heard = []
-    subscribe_draining(
+    subscribe_batched(
         reader, Int32, "numbers", heard.append, QOS, MutuallyExclusiveCallbackGroup(), max_at_once
     )
     publisher = sender.create_publisher(Int32, "numbers", QOS)
@@ -39,7 +39,7 @@ def test_waiting_messages_cost_one_wake_up_up_to_the_limit(ros_context, spinning
     sender = rclpy.create_node("sender", context=ros_context)
     reader = rclpy.create_node("reader", context=ros_context)
     heard = []
-    subscription = subscribe_draining(
+    subscription = subscribe_batched(
         reader, Int32, "numbers", heard.append, QOS, MutuallyExclusiveCallbackGroup(), 30
     )
     publisher = sender.create_publisher(Int32, "numbers", QOS)
