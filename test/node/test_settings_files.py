@@ -7,12 +7,15 @@ import pytest
 pytest.importorskip("rclpy")
 
 import rclpy
+import yaml
 
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
 from uw_dslam_ros2.ros.nodes.sonar_mapper import SonarMapper
-from uw_dslam_ros2.ros.plumbing.parameter_table import parameter_tables, with_tables
+from uw_dslam_ros2.ros.plumbing.node_settings import NODE_CONFIGS
+from uw_dslam_ros2.ros.plumbing.parameter_table import GROUPS, parameter_tables, with_tables
+from uw_dslam_ros2.ros.plumbing.parameters import settings_of
 
 pytestmark = pytest.mark.ros
 
@@ -51,8 +54,23 @@ def test_every_file_serves_every_node(start, name, path):
     assert start(name, path).get_name() == name
 
 
-def test_there_is_a_file_for_every_node():
-    assert set(NODES) <= {path.stem for path in FILES}
+@pytest.mark.parametrize("name", NODES)
+def test_file_of_a_node_has_all_that_users_set_at_its_default(name):
+    """Empty lists are left out: ROS cannot tell their type."""
+    values = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text())
+    items = [*settings_of(NODE_CONFIGS[name])]
+    for prefix, config_type in GROUPS[name]:
+        items += settings_of(config_type, prefix)
+    basic = {n: f.default for n, _, f in items if f.metadata["is_basic"] and f.default != ()}
+    assert _flat(values["/**"]["ros__parameters"]) == basic
+
+
+def _flat(values, prefix=""):
+    found = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        found |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return found
 
 
 def test_value_of_a_file_reaches_the_node(start, tmp_path):
