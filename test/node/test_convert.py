@@ -258,6 +258,34 @@ def test_verdicts_are_those_of_the_message(verdict):
     assert registration_from_msg(registration_to_msg(make_result(verdict))).verdict is verdict
 
 
+def test_a_refusal_without_a_pose_goes_both_ways_and_names_no_place():
+    refused = RegistrationResult.refused(Verdict.TOO_FEW_FEATURES, "3 points", num_points=(3, 9))
+    msg = registration_to_msg(refused)
+    assert all(math.isnan(value) for value in (*transform_values(msg), *msg.covariance))
+    assert (msg.probability, msg.lower_bound, msg.upper_bound, msg.gap) == (0.0, 0.0, 1.0, 1.0)
+    again = registration_from_msg(msg)
+    assert again.T_target_source is None
+    assert (again.verdict, again.num_target_points) == (Verdict.TOO_FEW_FEATURES, 9)
+
+
+@pytest.mark.parametrize("verdict", list(Verdict))
+def test_half_a_transform_is_refused_and_so_is_none_that_is_accepted(verdict):
+    msg = registration_to_msg(make_result(verdict))
+    msg.t_target_source.x = math.nan
+    with pytest.raises(InvalidInputError, match=r"t_target_source\.x is nan"):
+        registration_from_msg(msg)
+    msg.t_target_source.y = msg.t_target_source.yaw = math.nan
+    if verdict is Verdict.ACCEPTED:
+        with pytest.raises(InvalidInputError, match=r"t_target_source\.x is nan"):
+            registration_from_msg(msg)
+    else:
+        assert registration_from_msg(msg).T_target_source is None
+
+
+def transform_values(msg):
+    return msg.t_target_source.x, msg.t_target_source.y, msg.t_target_source.yaw
+
+
 def test_registration_that_nobody_filled_in_is_refused():
     with pytest.raises(InvalidInputError, match="verdict is 0, expected 1 to 6"):
         registration_from_msg(Registration())

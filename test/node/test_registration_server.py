@@ -23,10 +23,9 @@ from uw_dslam_msgs.srv import RegisterMaps, RegisterPointSets
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration import register_grids
-from uw_dslam_ros2.core.registration.result import Progress
+from uw_dslam_ros2.core.registration.result import Progress, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg
-from uw_dslam_ros2.ros.convert.registration import refused_registration
 from uw_dslam_ros2.ros.nodes import registration_server
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
 
@@ -89,7 +88,7 @@ class Gate:
             self.opened.wait(0.005)
         with self._lock:
             self.num_running -= 1
-        return refused_registration("the gate was opened")
+        return RegistrationResult.refused(Verdict.BUDGET_EXHAUSTED, "the gate was opened")
 
 
 @pytest.fixture
@@ -357,7 +356,7 @@ def test_action_speaks_before_the_search_does(serve, monkeypatch):
 
     def silent(*_, **__):
         opened.wait(30.0)
-        return refused_registration("done")
+        return RegistrationResult.refused(Verdict.BUDGET_EXHAUSTED, "done")
 
     monkeypatch.setattr(registration_server, "register_grids", silent)
     feedback = []

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from uw_dslam_ros2.ros.convert.registration import refused_registration
+from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.ros.plumbing.playback import Pacer
 from uw_dslam_ros2.ros.plumbing.registration_jobs import RegistrationJobs
 from uw_dslam_ros2.ros.plumbing.worker import Worker
@@ -66,7 +66,7 @@ def test_closing_jobs_ends_the_searches():
         begun.set()
         while not is_cancelled():
             pass
-        return refused_registration("cancelled")
+        return RegistrationResult.refused(Verdict.BUDGET_EXHAUSTED, "cancelled")
 
     first, second = jobs.submit(search), jobs.submit(search)
     assert begun.wait(PATIENCE_S)

@@ -72,6 +72,7 @@ class RegistrationRow:
     def of(cls, number: int, answer: Answer, is_used: bool) -> RegistrationRow:
         """Flatten an answer."""
         motion, numbers = answer.T_target_source, answer.numbers
+        x, y, yaw = (math.nan,) * 3 if motion is None else (motion.x, motion.y, motion.yaw)
         sigma_x, sigma_y, sigma_yaw = np.sqrt(np.maximum(np.diag(answer.covariance), 0.0))
         upper = numbers.get("upper_bound", math.nan)
         lower = numbers.get("lower_bound", math.nan)
@@ -82,9 +83,9 @@ class RegistrationRow:
             answer.verdict.name,
             answer.reason,
             is_used,
-            motion.x,
-            motion.y,
-            motion.yaw,
+            x,
+            y,
+            yaw,
             float(sigma_x),
             float(sigma_y),
             float(sigma_yaw),

@@ -92,6 +92,9 @@ def _run(args: argparse.Namespace) -> int:
         from uw_dslam_ros2.cli.pictures import overlay, png_bytes
 
         motion = result.T_target_source
+        if motion is None:
+            print("no picture: there is no pose to draw", file=sys.stderr)
+            return EXIT_CODES[result.verdict]
         state = "" if result.is_accepted else ": refused, this is only the best guess"
         title = (
             f"{result.verdict.name}{state}\nx {motion.x:.2f} m, y {motion.y:.2f} m, "
@@ -119,6 +122,8 @@ def _prior(args: argparse.Namespace) -> PriorWindow | None:
 
 def _lines(result: RegistrationResult) -> list[str]:
     motion = result.T_target_source
+    if motion is None:
+        return [f"{result.verdict.name}, refused before any pose was judged: {result.reason}"]
     sigma_x, sigma_y, sigma_yaw = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))
     note = "" if result.is_accepted else "   (refused: the best guess, not to be used)"
     certainty = ""
@@ -163,10 +168,11 @@ def _plain(result: RegistrationResult) -> dict[str, Any]:
         "num_source_points",
         "num_target_points",
     )
+    motion = result.T_target_source
     return {
         "verdict": result.verdict.name,
         "reason": result.reason,
-        "T_target_source": result.T_target_source.as_array().tolist(),
+        "T_target_source": None if motion is None else motion.as_array().tolist(),
         "covariance": np.asarray(result.covariance).tolist(),
         **{name: getattr(result, name) for name in names},
         "rivals": [

@@ -287,7 +287,7 @@ def _answer_digest(answer: Answer) -> bytes:
 
 
 def _answer_to_plain(answer: Answer) -> dict[str, Any]:
-    prior = answer.match.prior
+    prior, motion = answer.match.prior, answer.T_target_source
     return {
         "source": _unit_to_plain(answer.match.source),
         "target": _unit_to_plain(answer.match.target),
@@ -299,7 +299,7 @@ def _answer_to_plain(answer: Answer) -> dict[str, Any]:
         ],
         "verdict": int(answer.verdict),
         "reason": answer.reason,
-        "T_target_source": answer.T_target_source.as_array().tolist(),
+        "T_target_source": motion and motion.as_array().tolist(),
         "covariance": answer.covariance.tolist(),
         "probability": answer.probability,
         "numbers": answer.numbers,
@@ -307,7 +307,7 @@ def _answer_to_plain(answer: Answer) -> dict[str, Any]:
 
 
 def _answer_from_plain(plain: dict[str, Any]) -> Answer:
-    prior = plain["prior"]
+    prior, motion = plain["prior"], plain["T_target_source"]
     match = Match(
         _unit_from_plain(plain["source"]),
         _unit_from_plain(plain["target"]),
@@ -317,7 +317,7 @@ def _answer_from_plain(plain: dict[str, Any]) -> Answer:
         match,
         Verdict(plain["verdict"]),
         plain["reason"],
-        SE2(*plain["T_target_source"]),
+        None if motion is None else SE2(*motion),
         np.array(plain["covariance"], dtype=np.float64),
         plain["probability"],
         plain["numbers"],

@@ -137,15 +137,15 @@ def lawnmower_fleet(
 
 
 def make_result(
-    verdict: Verdict, T_target_source: SE2, sigma_m: float = 0.05, sigma_rad: float = 0.005
+    T_target_source: SE2, sigma_m: float = 0.05, sigma_rad: float = 0.005
 ) -> RegistrationResult:
-    """Answer with given transform and errors; what the queue does not read is left plain."""
+    """Accept a transform with its errors; what the queue does not read is left plain."""
     return RegistrationResult(
-        verdict=verdict,
-        reason="" if verdict is Verdict.ACCEPTED else verdict.name.lower().replace("_", " "),
+        verdict=Verdict.ACCEPTED,
+        reason="",
         T_target_source=T_target_source,
         covariance=np.diag([sigma_m**2, sigma_m**2, sigma_rad**2]),
-        probability=0.99 if verdict is Verdict.ACCEPTED else 0.05,
+        probability=0.99,
         score=0.8,
         lower_bound=0.8,
         upper_bound=0.8,
@@ -162,7 +162,7 @@ def make_result(
 
 def refuse(_request: MatchRequest) -> RegistrationResult:
     """Find nothing."""
-    return make_result(Verdict.NOT_ENOUGH_OVERLAP, SE2())
+    return RegistrationResult.refused(Verdict.NOT_ENOUGH_OVERLAP, "not enough overlap")
 
 
 @dataclass
@@ -187,15 +187,13 @@ class KnowingMatcher:
         digest = hashlib.blake2b(question, digest_size=8).digest()
         rng = np.random.default_rng([self.seed, int.from_bytes(digest)])
         if rng.random() < self.wrong_share:
-            return make_result(Verdict.ACCEPTED, self._lie(request, rng))
+            return make_result(self._lie(request, rng))
         truth = self.fleet.T_world_submap
         T_true = truth[request.target_reference].inverse() @ truth[request.source_reference]
         if known_overlap(request.source, request.target, T_true) < self.min_overlap:
-            return make_result(Verdict.NOT_ENOUGH_OVERLAP, SE2())
+            return refuse(request)
         noise = rng.normal(size=3) * (self.sigma_m, self.sigma_m, self.sigma_rad)
-        return make_result(
-            Verdict.ACCEPTED, T_true @ SE2.from_array(noise), self.sigma_m, self.sigma_rad
-        )
+        return make_result(T_true @ SE2.from_array(noise), self.sigma_m, self.sigma_rad)
 
     def _lie(self, request: MatchRequest, rng: np.random.Generator) -> SE2:
         middle, reach = np.zeros(3), np.array([40.0, 40.0, math.pi])

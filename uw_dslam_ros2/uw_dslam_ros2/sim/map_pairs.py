@@ -344,16 +344,16 @@ def _windows_at_an_end(
     return _window_at(first, yaws[0], half), _window_at(first + step, yaws[1], half)
 
 
-def pair_errors(pair: MapPair, T_target_source: SE2) -> tuple[float, float]:
-    """Errors at the source map's middle [m] and in rotation [rad]; infinite without truth."""
-    if pair.T_target_source is None:
+def pair_errors(pair: MapPair, T_target_source: SE2 | None) -> tuple[float, float]:
+    """Errors at the source map's middle [m], in rotation [rad]; infinite without truth or pose."""
+    if pair.T_target_source is None or T_target_source is None:
         return math.inf, math.inf
     middle = pair.source.spec.corners().mean(axis=0)
     offset = T_target_source.apply(middle) - pair.T_target_source.apply(middle)
     return float(np.hypot(*offset)), T_target_source.distance_to(pair.T_target_source)[1]
 
 
-def is_right(pair: MapPair, T_target_source: SE2) -> bool:
+def is_right(pair: MapPair, T_target_source: SE2 | None) -> bool:
     """Within 2 degrees and six cells, 0.30 m at 0.05 m."""
     error_m, error_rad = pair_errors(pair, T_target_source)
     return error_rad < _RIGHT_RAD and error_m < _RIGHT_CELLS * pair.source.spec.resolution_m

@@ -181,6 +181,7 @@ def test_hopeless_maps_get_a_sentence(values):
     ):
         result = register_grids(source, target)
         assert result.verdict is Verdict.TOO_FEW_FEATURES
+        assert result.T_target_source is None
         assert "map" in result.reason
 
 

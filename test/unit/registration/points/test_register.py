@@ -92,6 +92,8 @@ def test_too_few_points_are_an_answer(m):
     result = register_point_sets(np.zeros((m, 2)), np.random.default_rng(6).normal(size=(9, 2)))
     assert result.verdict is Verdict.TOO_FEW_FEATURES
     assert not result.is_certified
+    assert result.T_target_source is None
+    assert len(result.source_points) == len(result.is_inlier) == result.num_source_points == m
 
 
 def test_equal_points_are_never_accepted():

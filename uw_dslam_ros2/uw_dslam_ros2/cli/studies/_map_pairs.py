@@ -116,7 +116,7 @@ def registered(pair: MapPair) -> dict[str, Any]:
 
 def _nees(pair: MapPair, result: RegistrationResult) -> float:
     """Squared error over the stated covariance; 3 on average where that is true."""
-    if pair.T_target_source is None:
+    if pair.T_target_source is None or result.T_target_source is None:
         return math.nan
     error = result.T_target_source.as_array() - pair.T_target_source.as_array()
     error[2] = wrap_angle(error[2])

@@ -189,8 +189,8 @@ def _walls(occupancy: OccupancyMap) -> FloatArray:
 
 def _believed(motion: SE2 | None) -> RegistrationResult:
     if motion is None:
-        return make_result(Verdict.TOO_FEW_FEATURES, SE2())
-    return make_result(Verdict.ACCEPTED, motion)
+        return RegistrationResult.refused(Verdict.TOO_FEW_FEATURES, "nothing found")
+    return make_result(motion)
 
 
 # --- merging and scores ----------------------------------------------------------------------

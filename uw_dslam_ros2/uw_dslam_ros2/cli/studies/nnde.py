@@ -170,6 +170,7 @@ def _errors(log: LaserLog, first: int, args: argparse.Namespace) -> list[dict[st
     results = (passes.first, passes.second, paper.T_target_source, ours.T_target_source)
     accepted = (True, True, paper.is_accepted, ours.is_accepted)
     for stage, T_found, is_accepted in zip(_STAGES, results, accepted, strict=True):
+        assert T_found is not None
         error_m, error_rad = T_found.distance_to(T_true)
         rows.append(
             {

@@ -150,6 +150,7 @@ def _draw_cases(cells: Sequence[Cell], args: argparse.Namespace) -> None:
         letter = _letter(cell)
         problem = cell.problem(args.seed)
         result = register_point_sets(problem.source, problem.target)
+        assert result.T_target_source is not None
         error_m, error_rad = result.T_target_source.distance_to(problem.T_target_source)
         after = result.T_target_source.apply(problem.source)
         for row, source in enumerate((problem.source, after)):

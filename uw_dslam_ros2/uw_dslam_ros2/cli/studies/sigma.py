@@ -78,6 +78,7 @@ def _cell(cell: Cell, seeds: Sequence[int]) -> list[dict[str, Any]]:
         for problem in problems:
             source, target, T_true = problem.source, problem.target, problem.T_target_source
             result = register_point_sets(source, target, config)
+            assert result.T_target_source is not None
             chain.append((result.T_target_source, T_true))
             boxes.append(result.num_boxes)
             if multiple is not None:

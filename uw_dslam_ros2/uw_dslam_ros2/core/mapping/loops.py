@@ -130,14 +130,17 @@ def _agreed(
         _REGISTRATION,
         prior=window,
     )
-    if judged.is_accepted and _is_within(judged.T_target_source, window):
+    found = judged.T_target_source
+    if found is None:
+        return None
+    if judged.is_accepted and _is_within(found, window):
         # The engine's last digits depend on how memory is aligned; the mapper's must not.
-        return SE2.from_array(np.round(judged.T_target_source.as_array(), _DIGITS))
+        return SE2.from_array(np.round(found.as_array(), _DIGITS))
     # Whether the walls would fit elsewhere too is asked below, where the prior has its say.
     is_open = judged.verdict in (Verdict.NOT_ENOUGH_OVERLAP, Verdict.AMBIGUOUS)
     if not is_open or not _is_sure(guess, target, source, config):
         return None
-    distance, turn = judged.T_target_source.distance_to(guess.T_target_source)
+    distance, turn = found.distance_to(guess.T_target_source)
     is_same = distance <= 3.0 * config.match.sigma_m and turn <= _NEAR_RAD
     return guess.T_target_source if is_same else None
 

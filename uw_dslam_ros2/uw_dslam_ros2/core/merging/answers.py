@@ -13,7 +13,7 @@ from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["Answer", "AnswerBook", "Match", "MatchKey", "numbers_of"]
+__all__ = ["Answer", "AnswerBook", "Match", "MatchKey"]
 
 FloatArray = NDArray[np.float64]
 
@@ -42,10 +42,23 @@ class Answer:
     match: Match
     verdict: Verdict
     reason: str
-    T_target_source: SE2
+    T_target_source: SE2 | None  # None where no pose was judged
     covariance: FloatArray
     probability: float
     numbers: dict[str, float] = field(default_factory=dict)  # of the result, for reports
+
+    @classmethod
+    def of(cls, match: Match, result: RegistrationResult) -> Answer:
+        """What to keep of a result."""
+        return cls(
+            match,
+            result.verdict,
+            result.reason,
+            result.T_target_source,
+            np.array(result.covariance, dtype=np.float64),
+            result.probability,
+            _numbers_of(result),
+        )
 
     @property
     def is_accepted(self) -> bool:
@@ -72,10 +85,11 @@ class Answer:
         )
 
     def is_inside(self, prior: PriorWindow | None) -> bool:
-        """Whether the transform lies in a window, or there is none."""
-        if prior is None:
-            return True
-        guess, found = prior.T_target_source, self.T_target_source
+        """Whether there is a transform, and where there is a window, that lies in it."""
+        found = self.T_target_source
+        if prior is None or found is None:
+            return found is not None
+        guess = prior.T_target_source
         # A refinement may step over the border by a little.
         return (
             abs(found.x - guess.x) <= 1.1 * prior.half_width_m
@@ -148,7 +162,7 @@ _NUMBERS = (
 )
 
 
-def numbers_of(result: RegistrationResult) -> dict[str, float]:
+def _numbers_of(result: RegistrationResult) -> dict[str, float]:
     """Proof and measurements of a result by name, where known; no times, which differ each run."""
     values = {name: float(getattr(result, name)) for name in _NUMBERS}
     return {name: value for name, value in values.items() if math.isfinite(value)}

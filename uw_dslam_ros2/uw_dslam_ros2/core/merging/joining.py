@@ -35,6 +35,7 @@ def joint_of(library: Library, answer: Answer) -> Joint:
     """
     source, target = answer.match.source, answer.match.target
     T_target_source = answer.T_target_source
+    assert T_target_source is not None
     ends = _ends(library, source, target, T_target_source)
     left = target.T_reference_submap[ends[1]].inverse()
     right = source.T_reference_submap[ends[0]]

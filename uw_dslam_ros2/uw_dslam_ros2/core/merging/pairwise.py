@@ -108,6 +108,7 @@ def _merge_first(
             return None
         refused.add(pair)
         if answer.is_accepted:
+            assert answer.T_target_source is not None
             joints.append(verifier.joint(answer))
             T_first_other = (
                 first[target.reference]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
-from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, numbers_of
+from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MapQueueConfig
 from uw_dslam_ros2.core.merging.fusion import Window
 from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
@@ -119,16 +119,7 @@ class MapQueue:
         match = self._in_flight.pop(request_id, None)
         if match is None:
             return
-        covariance = np.array(result.covariance, dtype=np.float64)
-        self._answers[match.key] = Answer(
-            match,
-            result.verdict,
-            result.reason,
-            result.T_target_source,
-            covariance,
-            result.probability,
-            numbers_of(result),
-        )
+        self._answers[match.key] = Answer.of(match, result)
         self._change()
 
     def cancel_request(self, request_id: int) -> None:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from uw_dslam_msgs.msg import Registration, RegistrationOptions, RegistrationRival
+from uw_dslam_msgs.msg import Registration, RegistrationOptions, RegistrationRival, Transform2D
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration.result import (
@@ -30,7 +30,6 @@ from uw_dslam_ros2.ros.convert.core_types import (
 __all__ = [
     "options_from_msg",
     "options_to_msg",
-    "refused_registration",
     "registration_from_msg",
     "registration_to_msg",
 ]
@@ -83,7 +82,7 @@ _PLAIN_FLOATS = (
 def registration_to_msg(result: RegistrationResult) -> Registration:
     """Message of a registration's outcome."""
     msg = Registration(verdict=int(result.verdict), reason=result.reason)
-    msg.t_target_source = transform2d_to_msg(result.T_target_source)
+    msg.t_target_source = _transform_to_msg(result.T_target_source)
     msg.covariance = covariance_to_list(result.covariance)
     for name in _PLAIN_FLOATS:
         setattr(msg, name, float(getattr(result, name)))
@@ -94,6 +93,19 @@ def registration_to_msg(result: RegistrationResult) -> Registration:
     msg.num_target_points = int(result.num_target_points)
     msg.rivals = [_rival_to_msg(rival) for rival in result.rivals]
     return msg
+
+
+def _transform_to_msg(T_target_source: SE2 | None) -> Transform2D:
+    if T_target_source is None:
+        return Transform2D(x=math.nan, y=math.nan, yaw=math.nan)
+    return transform2d_to_msg(T_target_source)
+
+
+def _transform_from_msg(msg: Transform2D, verdict: Verdict, name: str) -> SE2 | None:
+    is_none = all(math.isnan(value) for value in (msg.x, msg.y, msg.yaw))
+    if is_none and verdict is not Verdict.ACCEPTED:
+        return None
+    return transform2d_from_msg(msg, name)
 
 
 def _rival_to_msg(rival: Rival) -> RegistrationRival:
@@ -111,13 +123,16 @@ def registration_from_msg(msg: Registration) -> RegistrationResult:
             f"registration.verdict is {msg.verdict}, "
             f"expected {min(Verdict).value} to {max(Verdict).value}"
         )
+    verdict = Verdict(msg.verdict)
     covariance = np.array(msg.covariance, dtype=np.float64).reshape(3, 3)
-    if msg.verdict == Verdict.ACCEPTED:
+    if verdict is Verdict.ACCEPTED:
         check_covariance(covariance, "registration.covariance")
     return RegistrationResult(
-        verdict=Verdict(msg.verdict),
+        verdict=verdict,
         reason=msg.reason,
-        T_target_source=transform2d_from_msg(msg.t_target_source, "registration.t_target_source"),
+        T_target_source=_transform_from_msg(
+            msg.t_target_source, verdict, "registration.t_target_source"
+        ),
         covariance=covariance,
         probability=float(msg.probability),
         score=float(msg.score),
@@ -132,29 +147,6 @@ def registration_from_msg(msg: Registration) -> RegistrationResult:
         num_source_points=int(msg.num_source_points),
         num_target_points=int(msg.num_target_points),
         rivals=_rivals_from_msg(msg.rivals),
-    )
-
-
-def refused_registration(reason: str) -> RegistrationResult:
-    """Outcome for a question that no server could answer: nothing was proven."""
-    nan = float("nan")
-    return RegistrationResult(
-        verdict=Verdict.BUDGET_EXHAUSTED,
-        reason=reason,
-        T_target_source=SE2(),
-        covariance=np.full((3, 3), nan),
-        probability=0.0,
-        score=0.0,
-        lower_bound=0.0,
-        upper_bound=1.0,
-        is_certified=False,
-        num_boxes=0,
-        seconds=nan,
-        overlap=nan,
-        conflict_ratio=nan,
-        inlier_ratio=nan,
-        num_source_points=0,
-        num_target_points=0,
     )
 
 

@@ -27,6 +27,7 @@ from uw_dslam_ros2.core.merging import (
     MatchRequest,
     SubmapState,
 )
+from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.session import load_session, save_session
@@ -36,11 +37,7 @@ from uw_dslam_ros2.ros.convert.merging import (
     graph_to_markers,
     record_to_msg,
 )
-from uw_dslam_ros2.ros.convert.registration import (
-    options_to_msg,
-    refused_registration,
-    registration_from_msg,
-)
+from uw_dslam_ros2.ros.convert.registration import options_to_msg, registration_from_msg
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
 from uw_dslam_ros2.ros.plumbing.idle_timeout import IdleTimeout
@@ -243,9 +240,9 @@ class MapQueueManager(Node):
             try:
                 result = registration_from_msg(response.registration)
             except InvalidInputError as error:
-                result = refused_registration(f"unusable answer: {error}")
+                result = _unanswered(f"unusable answer: {error}")
         else:
-            result = refused_registration(f"the server could not answer: {response.message}")
+            result = _unanswered(f"the server could not answer: {response.message}")
         self._counts[f"num_{result.verdict.name.lower()}"] += 1
         self._queue.add_result(request_id, result)
         pair = f"{_names(request.source_ids)} to {_names(request.target_ids)}"
@@ -374,6 +371,10 @@ class MapQueueManager(Node):
         num_servers = self._values.get("num_servers", 0)
         is_well = num_servers != 0
         return is_well, self._message if is_well else "no registration server on the graph", values
+
+
+def _unanswered(reason: str) -> RegistrationResult:
+    return RegistrationResult.refused(Verdict.BUDGET_EXHAUSTED, reason)
 
 
 def _frame_of(submap_id: SubmapId) -> str:

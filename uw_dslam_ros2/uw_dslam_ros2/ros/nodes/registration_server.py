@@ -34,7 +34,6 @@ from uw_dslam_ros2.core.registration import (
     register_point_sets,
 )
 from uw_dslam_ros2.core.registration.result import Progress, RegistrationResult, Verdict
-from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, transform2d_to_msg
 from uw_dslam_ros2.ros.convert.registration import options_from_msg, registration_to_msg
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
@@ -217,7 +216,14 @@ class RegistrationServer(Node):
         if is_cancelled and not job.wait(_CANCEL_PATIENCE_S):
             # Answered now; the search stops at its next look, and keeps its place until then.
             result.result = result.DONE
-            result.registration = registration_to_msg(_best_so_far(job))
+            refused = RegistrationResult.refused(
+                Verdict.BUDGET_EXHAUSTED,
+                "cancelled before the proof was complete"
+                + ("; this is the best found so far" if job.newest else ""),
+                best_so_far=job.newest,
+                seconds=time.monotonic() - job.begun_s,
+            )
+            result.registration = registration_to_msg(refused)
             self._statistics.count("cancelled")
         else:
             self._finish(job, result)
@@ -290,29 +296,6 @@ def _feedback(progress: Progress | None, seconds: float) -> RegisterMapsAction.F
         num_open_boxes=int(progress.num_open_boxes),
         seconds=float(seconds),
         t_target_source=transform2d_to_msg(progress.T_target_source),
-    )
-
-
-def _best_so_far(job: Job) -> RegistrationResult:
-    """What a search that was stopped had proven."""
-    newest = job.newest
-    return RegistrationResult(
-        verdict=Verdict.BUDGET_EXHAUSTED,
-        reason="cancelled before the proof was complete; this is the best found so far",
-        T_target_source=newest.T_target_source if newest else SE2(),
-        covariance=np.full((3, 3), np.nan),
-        probability=0.0,
-        score=newest.lower_bound if newest else 0.0,
-        lower_bound=newest.lower_bound if newest else 0.0,
-        upper_bound=newest.upper_bound if newest else 1.0,
-        is_certified=False,
-        num_boxes=newest.num_boxes if newest else 0,
-        seconds=time.monotonic() - job.begun_s,
-        overlap=float("nan"),
-        conflict_ratio=float("nan"),
-        inlier_ratio=float("nan"),
-        num_source_points=0,
-        num_target_points=0,
     )
 
 

@@ -62,6 +62,8 @@ def register_grids_by_points(
         progress=progress,
         is_cancelled=is_cancelled,
     )
+    if result.T_target_source is None:
+        return result
     resolution_m = max(source.spec.resolution_m, target.spec.resolution_m)
     walls = [WallMap(coarsen(clean_cells(m), resolution_m)) for m in (source, target)]
     T_grids = (

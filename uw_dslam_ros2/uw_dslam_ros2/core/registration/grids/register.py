@@ -285,30 +285,7 @@ class _GridMatch:
         return self._clock() - self._start_s if self._clock is not None else math.nan
 
     def _refused(self, verdict: Verdict, reason: str) -> RegistrationResult:
-        """An answer without a search; the guess is the prior, or lays centre on centre."""
-        if self._prior is not None:
-            motion = self._prior.T_target_source
-        else:
-            source, target = (m.spec.corners().mean(axis=0) for m in (self._source, self._target))
-            motion = SE2(float(target[0] - source[0]), float(target[1] - source[1]), 0.0)
-        return RegistrationResult(
-            verdict=verdict,
-            reason=reason,
-            T_target_source=motion,
-            covariance=np.diag([1e6, 1e6, math.pi**2]),
-            probability=0.0,
-            score=0.0,
-            lower_bound=0.0,
-            upper_bound=1.0,
-            is_certified=False,
-            num_boxes=0,
-            seconds=self._elapsed(),
-            overlap=math.nan,
-            conflict_ratio=math.nan,
-            inlier_ratio=0.0,
-            num_source_points=0,
-            num_target_points=0,
-        )
+        return RegistrationResult.refused(verdict, reason, seconds=self._elapsed())
 
 
 def _with_twins(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,24 +173,13 @@ def too_few(
     """Answer to sets that no pose can be told from."""
     m, n = len(source.points), len(target.points)
     reason = f"{m} source and {n} target points, at least {config.min_points} of each needed"
-    return RegistrationResult(
-        verdict=Verdict.TOO_FEW_FEATURES,
-        reason=reason,
-        T_target_source=SE2(*(target.center - source.center)) if m and n else SE2(),
-        covariance=np.full((3, 3), math.inf),
-        probability=0.0,
-        score=0.0,
-        lower_bound=0.0,
-        upper_bound=1.0,
-        is_certified=False,
-        num_boxes=0,
-        seconds=seconds,
-        overlap=math.nan,
-        conflict_ratio=math.nan,
-        inlier_ratio=0.0,
-        num_source_points=m,
-        num_target_points=n,
-        source_points=source.original(),
-        target_points=target.original(),
+    refused = RegistrationResult.refused(
+        Verdict.TOO_FEW_FEATURES, reason, seconds=seconds, num_points=(m, n)
+    )
+    points = source.original(), target.original()
+    return replace(
+        refused,
+        source_points=points[0],
+        target_points=points[1],
         is_inlier=np.zeros(m, dtype=np.bool_),
     )
