@@ -1,4 +1,4 @@
-"""The echoes of the last stretch of way, against which the next ping is matched."""
+"""The echoes of the last stretch of the path, against which the next ping is matched."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ class LocalMap:
     def __init__(self, config: MatchConfig) -> None:
         self._config = config
         self._pings: deque[tuple[FloatArray, FloatArray, float]] = deque()
-        self._way_m = 0.0
+        self._path_length_m = 0.0
         self._last: SE2 | None = None
 
     def add(self, points: FloatArray, weight: FloatArray, T_submap_base: SE2) -> None:
         """Add a key ping's echoes (N, 2) in the submap's frame; forget those too far back."""
         if self._last is not None:
-            self._way_m += self._last.distance_to(T_submap_base)[0]
+            self._path_length_m += self._last.distance_to(T_submap_base)[0]
         self._last = T_submap_base
-        self._pings.append((points, weight, self._way_m))
-        while self._way_m - self._pings[0][2] > self._config.local_length_m:
+        self._pings.append((points, weight, self._path_length_m))
+        while self._path_length_m - self._pings[0][2] > self._config.local_length_m:
             self._pings.popleft()
 
     def rebase(self, T_new_old: SE2) -> None:
         """Move everything to a new submap's frame."""
-        self._pings = deque((T_new_old.apply(p), w, way) for p, w, way in self._pings)
+        self._pings = deque((T_new_old.apply(p), w, at_m) for p, w, at_m in self._pings)
         if self._last is not None:
             self._last = T_new_old @ self._last
 

@@ -97,7 +97,7 @@ class OpenSection:
         return np.array(self._stamps_ns, dtype=np.int64)
 
     def add(self, detections: Detections, T_submap_base: SE2, T_base_sonar: SE2) -> None:
-        """Add one ping; it enters the grid only after some way, turn or time since the last."""
+        """Add one ping; it enters the grid only some distance, turn or time after the last."""
         stamp_ns = detections.stamp_ns
         if self._trajectory:
             x, y, _ = self._trajectory[-1]
@@ -114,7 +114,7 @@ class OpenSection:
                 self._weight.append(detections.weight)
 
     def should_close(self, stamp_ns: int, sigma_m: float) -> bool:
-        """Whether way, time or uncertainty says so."""
+        """Whether it has become long, old or uncertain enough."""
         config: SubmapConfig = self._config.submap
         if self.num_pings < config.min_pings:
             return False

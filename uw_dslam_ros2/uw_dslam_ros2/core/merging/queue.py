@@ -298,13 +298,13 @@ class MapQueue:
                 plan = make(library, self._answers, self._standing, anchor, self._config)
             self._standing = frozenset(joint.key for joint in plan.joints if joint.is_inlier)
             self._plan_cache = plan
-            if self._goes_over(plan):
+            if self._pin_for_good(plan):
                 self._plan_cache = None
                 return self._plan()
         return self._plan_cache
 
-    def _goes_over(self, plan: Plan) -> bool:
-        """Pin the frame for good where vehicles are joined; whether that is another submap."""
+    def _pin_for_good(self, plan: Plan) -> bool:
+        """Pin the frame where vehicles are joined, once nothing is open; True if that moves it."""
         if self._is_pinned or self._is_growing or plan.wanted or self._in_flight:
             return False
         joined = [part for part in plan.components if len({i[0] for i in part}) > 1]
