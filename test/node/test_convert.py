@@ -287,7 +287,7 @@ def transform_values(msg):
 
 
 def test_registration_that_nobody_filled_in_is_refused():
-    with pytest.raises(InvalidInputError, match="verdict is 0, expected 1 to 6"):
+    with pytest.raises(InvalidInputError, match="verdict is 0, expected 1 to 7"):
         registration_from_msg(Registration())
 
 

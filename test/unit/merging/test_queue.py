@@ -366,7 +366,7 @@ def test_answers_that_are_not_sure_enough_alone_join_where_they_all_agree():
         answer = KnowingMatcher(FLEET)(request)
         if not answer.is_accepted:
             return answer
-        return dataclasses.replace(answer, verdict=Verdict.NOT_ENOUGH_OVERLAP, probability=0.7)
+        return dataclasses.replace(answer, verdict=Verdict.IMPROBABLE, probability=0.7)
 
     queue = filled()
     answer_all(queue, unsure)
@@ -384,7 +384,7 @@ def test_only_edges_of_refused_answers_are_marked_unsure():
         answer = KnowingMatcher(FLEET)(request)
         if request.prior is None or not answer.is_accepted:
             return answer
-        return dataclasses.replace(answer, verdict=Verdict.NOT_ENOUGH_OVERLAP, probability=0.7)
+        return dataclasses.replace(answer, verdict=Verdict.IMPROBABLE, probability=0.7)
 
     queue = filled()
     answer_all(queue, half_sure)

@@ -35,6 +35,7 @@ EXIT_CODES = {
     Verdict.AMBIGUOUS: 5,
     Verdict.CONTRADICTED: 6,
     Verdict.BUDGET_EXHAUSTED: 7,
+    Verdict.IMPROBABLE: 8,
 }
 """Exit code for each verdict; 1 is an unexpected error, 2 wrong usage or input."""
 

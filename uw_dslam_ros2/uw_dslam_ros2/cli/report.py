@@ -23,10 +23,11 @@ __all__ = ["RunFacts", "headline", "write_report"]
 _MEANING = {
     Verdict.ACCEPTED: "the transform may be used",
     Verdict.TOO_FEW_FEATURES: "too little to match in one of the maps",
-    Verdict.NOT_ENOUGH_OVERLAP: "the maps share too little, or no better than chance",
+    Verdict.NOT_ENOUGH_OVERLAP: "the maps share too small an area",
     Verdict.AMBIGUOUS: "several poses explain the maps about equally well",
     Verdict.CONTRADICTED: "free space of one map lies on walls of the other",
     Verdict.BUDGET_EXHAUSTED: "stopped before the proof was complete",
+    Verdict.IMPROBABLE: "not probable enough, or no better than chance",
 }
 
 

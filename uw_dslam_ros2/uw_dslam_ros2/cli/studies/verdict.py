@@ -7,7 +7,7 @@ it by itself, on all refined poses; and whether the best pose is right, in view 
 rival. The first model also says which pose is the best, so after it has changed much the evidence
 has to be gathered once more for the second to be that of its choices. The models are
 judged on other seeds and on kinds of places that the fit never saw. The coefficients that this
-command prints are those of `uw_dslam_ros2.core.registration.grids.verdict.MODELS`.
+command prints are those of `uw_dslam_ros2.core.registration.grids.probability.MODELS`.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from uw_dslam_ros2.cli.studies._common import (
     share_interval,
 )
 from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, random_prior
-from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, match_evidence
-from uw_dslam_ros2.core.registration.grids.verdict import (
+from uw_dslam_ros2.core.registration.grids.probability import (
     MATCH_FEATURES,
     POSE_FEATURES,
     MatchEvidence,
     PoseEvidence,
     VerdictModels,
-    decide,
     match_features,
     pose_features,
     probability_of,
     rival_probability,
 )
+from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, match_evidence
+from uw_dslam_ros2.core.registration.grids.verdict import decide
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.sim.map_pairs import is_right
 

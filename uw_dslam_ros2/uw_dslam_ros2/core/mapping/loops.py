@@ -33,6 +33,7 @@ _SURE_LEAD, _SURE_CONFLICT = 0.05, 0.1
 _NEAR_RAD = 0.02
 _COARSEST = 8.0
 # The proof matters less than the verdict here: the window is small and many pairs are tried.
+_OPEN = Verdict.NOT_ENOUGH_OVERLAP, Verdict.IMPROBABLE, Verdict.AMBIGUOUS
 _REGISTRATION = GridRegistrationConfig(max_boxes=20_000)
 
 
@@ -137,8 +138,7 @@ def _agreed(
         # The engine's last digits depend on how memory is aligned; the mapper's must not.
         return SE2.from_array(np.round(found.as_array(), _DIGITS))
     # Whether the walls would fit elsewhere too is asked below, where the prior has its say.
-    is_open = judged.verdict in (Verdict.NOT_ENOUGH_OVERLAP, Verdict.AMBIGUOUS)
-    if not is_open or not _is_sure(guess, target, source, config):
+    if judged.verdict not in _OPEN or not _is_sure(guess, target, source, config):
         return None
     distance, turn = found.distance_to(guess.T_target_source)
     is_same = distance <= 3.0 * config.match.sigma_m and turn <= _NEAR_RAD

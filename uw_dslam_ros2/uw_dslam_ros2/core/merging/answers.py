@@ -17,6 +17,8 @@ __all__ = ["Answer", "AnswerBook", "Match", "MatchKey"]
 
 FloatArray = NDArray[np.float64]
 
+_GUESSES = Verdict.ACCEPTED, Verdict.NOT_ENOUGH_OVERLAP, Verdict.IMPROBABLE
+
 MatchKey = tuple[bytes, bytes, tuple[float, ...]]
 """Source unit, target unit, prior: equal keys are the same question and get the same answer."""
 
@@ -68,8 +70,7 @@ class Answer:
     @property
     def is_guess(self) -> bool:
         """Whether the transform means anything: accepted, or merely not sure enough."""
-        is_unsure = self.verdict in (Verdict.ACCEPTED, Verdict.NOT_ENOUGH_OVERLAP)
-        return is_unsure and self.is_inside(self.match.prior)
+        return self.verdict in _GUESSES and self.is_inside(self.match.prior)
 
     def is_about(self, prior: PriorWindow) -> bool:
         """Whether nearly this window was searched: the middle of each lies well in the other."""

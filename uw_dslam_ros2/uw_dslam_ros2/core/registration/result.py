@@ -28,6 +28,7 @@ class Verdict(enum.IntEnum):
     AMBIGUOUS = 4
     CONTRADICTED = 5
     BUDGET_EXHAUSTED = 6
+    IMPROBABLE = 7
 
 
 @dataclass(frozen=True, slots=True)

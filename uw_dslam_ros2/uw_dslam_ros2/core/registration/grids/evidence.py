@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.registration.grids.agreement import WallMap, measure_agreement
 from uw_dslam_ros2.core.registration.grids.candidates import Candidate, Chance, climb, log_volume
 from uw_dslam_ros2.core.registration.grids.covariance import slide_share
+from uw_dslam_ros2.core.registration.grids.probability import (
+    MatchEvidence,
+    PoseEvidence,
+    pose_logit,
+)
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
-from uw_dslam_ros2.core.registration.grids.verdict import MatchEvidence, PoseEvidence, pose_logit
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 __all__ = ["Found", "Judge", "is_same_pose", "refine", "weigh"]

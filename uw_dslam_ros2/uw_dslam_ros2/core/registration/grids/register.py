@@ -19,6 +19,11 @@ from uw_dslam_ros2.core.registration.grids.evidence import Found, weigh
 from uw_dslam_ros2.core.registration.grids.frames import GridFrames
 from uw_dslam_ros2.core.registration.grids.paper import register_grids_by_points
 from uw_dslam_ros2.core.registration.grids.preparation import FINE_SIGMA_CELLS, prepare_maps
+from uw_dslam_ros2.core.registration.grids.probability import (
+    MatchEvidence,
+    PoseEvidence,
+    probability_of,
+)
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grids.search import (
     SearchLimits,
@@ -26,12 +31,7 @@ from uw_dslam_ros2.core.registration.grids.search import (
     search_poses,
 )
 from uw_dslam_ros2.core.registration.grids.symmetry import add_twins
-from uw_dslam_ros2.core.registration.grids.verdict import (
-    MatchEvidence,
-    PoseEvidence,
-    decide,
-    probability_of,
-)
+from uw_dslam_ros2.core.registration.grids.verdict import Proof, decide
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
     Progress,
@@ -219,31 +219,20 @@ class _GridMatch:
     ) -> RegistrationResult:
         work, finest = levels[0], levels[-1]
         pose, agreement = found.refined[0].pose, found.evidence.best.agreement
-        verdict, reason, probability = decide(found.evidence, self._config)
         at_work = work.to_pose(finest.to_motion(pose))
         score, (_, summit) = work.value(at_work), work.ascend(at_work)
-        is_optimum = summit >= (1.0 - self._config.gap) * outcome.lower_bound - _SAME_SCORE
-        if not is_optimum:
-            reason = (
-                f"{reason}; another pose has a higher score, {outcome.lower_bound:.3f} against "
-                f"{score:.3f}, but the maps speak for this one"
-            )
-            if self._config.is_proof_required and verdict is Verdict.ACCEPTED:
-                verdict = Verdict.AMBIGUOUS
-        if verdict is Verdict.ACCEPTED and not outcome.is_complete:
-            # Evidence decides what is right; the proof, how much better another pose could score.
-            open_gap = (
-                f"the proof stopped after {outcome.num_boxes} boxes with a gap of "
-                f"{1.0 - outcome.lower_bound / max(outcome.upper_bound, 1e-12):.0%}, "
-                f"asked were {self._config.gap:.0%}"
-            )
-            if self._config.is_proof_required:
-                verdict, reason = Verdict.BUDGET_EXHAUSTED, open_gap
-            else:
-                reason = f"{reason}; {open_gap}"
-        if self._is_cancelled:
-            verdict = Verdict.BUDGET_EXHAUSTED
-            reason = f"cancelled after {outcome.num_boxes} boxes, before the proof was complete"
+        proof = Proof(
+            is_complete=outcome.is_complete,
+            is_optimum=summit >= (1.0 - self._config.gap) * outcome.lower_bound - _SAME_SCORE,
+            is_cancelled=self._is_cancelled,
+            num_boxes=outcome.num_boxes,
+            score=score,
+            lower_bound=outcome.lower_bound,
+            upper_bound=outcome.upper_bound,
+        )
+        verdict, reason, probability = decide(found.evidence, self._config, proof=proof)
+        if verdict is Verdict.TOO_FEW_FEATURES:
+            return self._refused(verdict, reason)
         motion = self._frames.to_frames(finest.to_motion(pose))
         bound = outcome.upper_bound / max(score, 1e-12)
         best_score = max(found.evidence.best.score, 1e-9)
@@ -268,7 +257,7 @@ class _GridMatch:
             score=score,
             lower_bound=outcome.lower_bound,
             upper_bound=outcome.upper_bound,
-            is_certified=outcome.is_complete and is_optimum,
+            is_certified=proof.is_complete and proof.is_optimum,
             num_boxes=outcome.num_boxes,
             seconds=self._elapsed(),
             overlap=agreement.overlap,

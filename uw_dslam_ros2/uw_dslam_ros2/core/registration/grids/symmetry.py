@@ -14,9 +14,9 @@ import numpy as np
 from uw_dslam_ros2.core.registration.grids.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.candidates import Candidate, log_volume, scan_candidates
 from uw_dslam_ros2.core.registration.grids.evidence import Found, Judge, is_same_pose, refine
+from uw_dslam_ros2.core.registration.grids.probability import PoseEvidence, pose_logit
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grids.search import whole_plane
-from uw_dslam_ros2.core.registration.grids.verdict import PoseEvidence, pose_logit
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["add_twins"]

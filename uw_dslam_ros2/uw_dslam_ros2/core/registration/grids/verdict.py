@@ -2,245 +2,248 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from uw_dslam_ros2.core.registration.grids.agreement import Agreement
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grids.probability import (
+    ENOUGH_DETAIL,
+    MODELS,
+    MatchEvidence,
+    VerdictModels,
+    probability_of,
+    rival_probability,
+)
 from uw_dslam_ros2.core.registration.result import Verdict
+from uw_dslam_ros2.core.registration.rules import Rule, at_least, at_most, first_that_applies
 
-__all__ = [
-    "MATCH_FEATURES",
-    "MODELS",
-    "POSE_FEATURES",
-    "MatchEvidence",
-    "PoseEvidence",
-    "VerdictModels",
-    "decide",
-    "match_features",
-    "pose_features",
-    "pose_logit",
-    "probability_of",
-    "rival_probability",
-]
+__all__ = ["Proof", "decide"]
+
+_IMPROBABLE_CONFLICT = 0.6  # of the conflict allowed, where a match is not probable either
+_LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
+_DOUBTED = 0.5  # most probability left to a pose that the maps do not tell from others
 
 
 @dataclass(frozen=True, slots=True)
-class PoseEvidence:
-    """What is known about one pose of two maps.
+class Proof:
+    """What a search proved of a pose; the defaults where there was none to be had.
 
-    ``score`` is the objective on the finest level, ``surprise`` how far that on the searched level
-    lies above what chance alignments of these two maps reach, in standard deviations of such.
+    ``score`` is the pose's own, the bounds are those of the best pose of all; ``is_optimum``:
+    the pose is that one, to the gap asked.
     """
 
-    agreement: Agreement
-    score: float
-    surprise: float
-
-
-@dataclass(frozen=True, slots=True)
-class MatchEvidence:
-    """What is known about the best pose of two maps, the most convincing one, and its rivals.
-
-    ``slide_share`` is the score some cells off in the least curved direction over the best one.
-    ``log_volume`` is the logarithm of the number of poses that were searched: the more there are,
-    the better the best of them is by chance.
-    """
-
-    best: PoseEvidence
-    rivals: tuple[PoseEvidence, ...]
-    slide_share: float
-    log_volume: float
+    is_complete: bool = True
+    is_optimum: bool = True
+    is_cancelled: bool = False
+    num_boxes: int = 0
+    score: float = 0.0
+    lower_bound: float = 0.0
+    upper_bound: float = 0.0
 
     @property
-    def rival_share(self) -> float:
-        """Greatest score of a rival over the best pose's."""
-        most = max((rival.score for rival in self.rivals), default=0.0)
-        return max(most, 0.0) / max(self.best.score, 1e-9)
+    def gap(self) -> float:
+        """What is left to prove, relative."""
+        return 1.0 - self.lower_bound / max(self.upper_bound, 1e-12)
 
 
-# More detail than this is no more proof: chance matches of large maps have it too.
-_ENOUGH_DETAIL = 600.0
-_LIKE_DEVIATIONS = 2.0  # by how many standard errors a rival that is the true pose may agree less
-# Wall cells next to each other agree or not together: so many count as one (design effect, the
-# scatter of sums over squares against that of independent cells: 2.5 to 6 in noisy maps).
-_CELLS_PER_SAMPLE = 5.0
-_LEAST_VARIANCE = 0.005  # of one sample, as if one in two hundred disagreed
-_LIKE_DETAIL = 0.02  # how much of the best pose's detail it shows at least, sharing less area
-_LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
+class _Case:
+    """A match as the table below asks about it."""
 
-POSE_FEATURES = (
-    "agreement",
-    "conflict",
-    "log_detail",
-    "chance",
-    "log_surprise",
-    "log_volume",
-)
-MATCH_FEATURES = ("pose", "rival")
-_MOST_LOGIT = 12.0
+    def __init__(
+        self,
+        evidence: MatchEvidence,
+        config: GridRegistrationConfig,
+        models: VerdictModels,
+        proof: Proof,
+    ) -> None:
+        self.evidence, self.config, self.models, self.proof = evidence, config, models, proof
+        self.agreement = evidence.best.agreement
+        self.not_finite = ", ".join(_not_finite(evidence, proof))
+        self.probability = 0.0 if self.not_finite else probability_of(evidence, models)
+        self.is_probable = self.probability >= config.min_probability
+        self.max_conflict = config.max_conflict
+        if not self.is_probable:
+            self.max_conflict *= _IMPROBABLE_CONFLICT
 
+    @property
+    def alone(self) -> float:
+        """Probability without the rivals."""
+        return probability_of(self.evidence, self.models, is_alone=True)
 
-@dataclass(frozen=True, slots=True)
-class VerdictModels:
-    """Logistic models, intercept first: of a pose for itself, and of the best among rivals."""
+    @property
+    def is_convincing(self) -> bool:
+        """Rivals only matter to a match that would be accepted without them."""
+        return self.alone >= self.config.min_probability
 
-    pose: tuple[float, ...]
-    match: tuple[float, ...]
+    @property
+    def rival(self) -> float:
+        """Probability of the most convincing rival, were the best pose not there."""
+        return rival_probability(self.evidence, self.models)
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether the maps agree so well that with more detail the match would be accepted."""
+        agreement, best = self.agreement, self.evidence.best
+        detailed = replace(agreement, num_detail=max(agreement.num_detail, ENOUGH_DETAIL))
+        richer = replace(self.evidence, best=replace(best, agreement=detailed))
+        is_like = agreement.agreement >= _LIKE_SHARE
+        return is_like and probability_of(richer, self.models) >= self.config.min_probability
 
-MODELS = VerdictModels(
-    pose=(-2.1782, 5.6615, -18.5572, 0.9167, -6.7008, 0.819, -0.2288),
-    match=(0.3367, 0.7635, -1.1911),
-)
-"""Fitted by `study verdict` with its default settings, which prints them."""
+    @property
+    def improbable(self) -> str:
+        """The probability that is too small."""
+        text = at_least(self.probability, self.config.min_probability, ".2f")
+        return f"right with probability {text}"
 
+    @property
+    def measured(self) -> str:
+        """What the probability is made of."""
+        agreement = self.agreement
+        return (
+            f"{agreement.agreement:.0%} of the common walls agree, {agreement.conflict:.0%} "
+            f"conflict, overlap {agreement.overlap:.0%}, best rival "
+            f"{self.evidence.rival_share:.0%}, score {self.evidence.best.surprise:.1f} "
+            "deviations above chance"
+        )
 
-def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
-    """Quantities that speak for or against a pose by itself, as `POSE_FEATURES`."""
-    agreement = pose.agreement
-    return (
-        agreement.agreement,
-        agreement.conflict,
-        math.log1p(min(agreement.num_detail, _ENOUGH_DETAIL)),
-        agreement.chance,
-        math.log(min(max(pose.surprise, 0.5), 30.0)),
-        log_volume,
-    )
+    @property
+    def higher(self) -> str:
+        """That another pose scores higher."""
+        proof = self.proof
+        return (
+            f"another pose has a higher score, {proof.lower_bound:.3f} against {proof.score:.3f}"
+        )
 
-
-def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tuple[float, ...]:
-    """Logit of the best pose for itself, and how convincing its strongest rival is, from 0 up."""
-    best, *rivals = (
-        _logit(pose_model, pose_features(pose, evidence.log_volume))
-        for pose in (evidence.best, *_serious_rivals(evidence))
-    )
-    return best, math.log1p(math.exp(max(rivals))) if rivals else 0.0
-
-
-def _serious_rivals(evidence: MatchEvidence) -> list[PoseEvidence]:
-    """Rivals that may be the true pose of a place that looks like itself.
-
-    The true pose agrees as well as its twin, for the maps are the same, and in the same kind of
-    detail. What agrees significantly less is repeated walls: the best pose would have to agree
-    better by chance than the true one.
-    """
-    best = evidence.best.agreement
-    return [
-        rival
-        for rival in evidence.rivals
-        if _lead(best, rival.agreement) < _LIKE_DEVIATIONS
-        and rival.agreement.num_detail >= _LIKE_DETAIL * best.num_detail
-    ]
-
-
-def probability_of(
-    evidence: MatchEvidence, models: VerdictModels = MODELS, *, is_alone: bool = False
-) -> float:
-    """Probability in [0, 1] that the best pose is right, of models fitted on simulated pairs.
-
-    ``is_alone`` leaves the rivals out.
-    """
-    if is_alone:
-        evidence = replace(evidence, rivals=())
-    logit = _logit(models.match, match_features(evidence, models.pose))
-    return 1.0 / (1.0 + math.exp(-logit))
+    @property
+    def open_gap(self) -> str:
+        """Where the proof ended."""
+        return (
+            f"the proof stopped after {self.proof.num_boxes} boxes with a gap of "
+            f"{self.proof.gap:.0%}, asked were {self.config.gap:.0%}"
+        )
 
 
-def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MODELS) -> float:
-    """Logit that a pose is right, from what speaks for it by itself."""
-    return _logit(models.pose, pose_features(pose, log_volume))
-
-
-def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
-    """How probable the most convincing serious rival would be if the best pose were not there."""
-    return max(
-        (
-            probability_of(replace(evidence, best=rival), models, is_alone=True)
-            for rival in _serious_rivals(evidence)
+_RULES: tuple[Rule[_Case, Verdict], ...] = (
+    Rule(
+        lambda c: c.proof.is_cancelled,
+        Verdict.BUDGET_EXHAUSTED,
+        lambda c: f"cancelled after {c.proof.num_boxes} boxes, before the proof was complete",
+    ),
+    Rule(
+        lambda c: c.not_finite != "",
+        Verdict.TOO_FEW_FEATURES,
+        lambda c: f"the maps hold too little to judge their best alignment by: {c.not_finite}",
+    ),
+    Rule(
+        lambda c: c.evidence.slide_share > c.config.max_slide_share,
+        Verdict.AMBIGUOUS,
+        lambda c: (
+            "the walls leave one direction free, as a straight wall does: some cells away the "
+            f"score is still {at_most(c.evidence.slide_share, c.config.max_slide_share)}"
         ),
-        default=0.0,
-    )
+        most_probability=_DOUBTED,
+    ),
+    Rule(
+        lambda c: c.agreement.overlap < c.config.min_overlap,
+        Verdict.NOT_ENOUGH_OVERLAP,
+        lambda c: (
+            "share of the smaller map's seen area that the best alignment has in common: "
+            f"{at_least(c.agreement.overlap, c.config.min_overlap)}"
+        ),
+    ),
+    Rule(
+        lambda c: c.agreement.conflict > c.max_conflict,
+        Verdict.CONTRADICTED,
+        lambda c: (
+            "share of the common walls that lie on the other map's free space: "
+            + at_most(c.agreement.conflict, c.max_conflict)
+            + ("" if c.is_probable else f" of what is {c.improbable}")
+        ),
+    ),
+    Rule(
+        lambda c: c.is_convincing and c.rival > c.config.max_rival_probability,
+        Verdict.AMBIGUOUS,
+        lambda c: (
+            "another pose agrees as well where it overlaps: if this one were not there, it would "
+            f"be right with probability {at_most(c.rival, c.config.max_rival_probability, '.2f')}"
+            f"; best score of another: {c.evidence.rival_share:.0%} of this one's"
+        ),
+        most_probability=_DOUBTED,
+    ),
+    Rule(
+        lambda c: c.is_convincing and not c.is_probable,
+        Verdict.AMBIGUOUS,
+        lambda c: (
+            f"another pose agrees about as well where it overlaps: beside it, {c.improbable}; "
+            f"without it, {c.alone:.2f}"
+        ),
+        most_probability=_DOUBTED,
+    ),
+    Rule(
+        lambda c: not c.is_probable and c.is_plain,
+        Verdict.AMBIGUOUS,
+        lambda c: (
+            f"what agrees are a few straight walls, as many places have them: {c.improbable}; "
+            f"{c.agreement.num_detail:.0f} cells of detail, {c.measured}"
+        ),
+    ),
+    Rule(
+        lambda c: not c.is_probable,
+        Verdict.IMPROBABLE,
+        lambda c: f"{c.improbable}: {c.measured}",
+    ),
+    Rule(
+        lambda c: c.config.is_proof_required and not c.proof.is_optimum,
+        Verdict.AMBIGUOUS,
+        lambda c: f"a proof is required, but {c.higher}: {c.measured}",
+    ),
+    Rule(
+        lambda c: c.config.is_proof_required and not c.proof.is_complete,
+        Verdict.BUDGET_EXHAUSTED,
+        lambda c: f"a proof is required, but {c.open_gap}",
+    ),
+    Rule(lambda _: True, Verdict.ACCEPTED, lambda c: c.measured),
+)
+"""What makes a match of two maps accepted: that only the last line applies.
 
-
-def _lead(best: Agreement, rival: Agreement) -> float:
-    """By how many standard errors one pose agrees better than another."""
-    variance = 0.0
-    for pose in (best, rival):
-        one = max(pose.agreement * (1.0 - pose.agreement), _LEAST_VARIANCE)
-        variance += one / max(pose.num_walls / _CELLS_PER_SAMPLE, 1.0)
-    return (best.agreement - rival.agreement) / math.sqrt(variance)
-
-
-def _logit(model: Sequence[float], features: Sequence[float]) -> float:
-    logit = model[0] + sum(c * x for c, x in zip(model[1:], features, strict=True))
-    return max(-_MOST_LOGIT, min(_MOST_LOGIT, logit))
+Evidence decides what is right; a proof only says how much better another pose could score.
+"""
 
 
 def decide(
-    evidence: MatchEvidence, config: GridRegistrationConfig, models: VerdictModels = MODELS
+    evidence: MatchEvidence,
+    config: GridRegistrationConfig,
+    models: VerdictModels = MODELS,
+    proof: Proof | None = None,
 ) -> tuple[Verdict, str, float]:
-    """Verdict, its reason with the numbers that decided, and the pose's probability."""
-    probability = probability_of(evidence, models)
-    agreement = evidence.best.agreement
-    if evidence.slide_share > config.max_slide_share:
-        reason = (
-            f"the walls leave one direction free, as a straight wall does: the score is still "
-            f"{evidence.slide_share:.0%} some cells away, expected at most "
-            f"{config.max_slide_share:.0%}"
-        )
-        return Verdict.AMBIGUOUS, reason, min(probability, 0.5)
-    if agreement.overlap < config.min_overlap:
-        reason = (
-            f"the best alignment shares {agreement.overlap:.0%} of the smaller map's seen area, "
-            f"expected at least {config.min_overlap:.0%}"
-        )
-        return Verdict.NOT_ENOUGH_OVERLAP, reason, probability
-    is_probable = probability >= config.min_probability
-    if agreement.conflict > (config.max_conflict if is_probable else 0.6 * config.max_conflict):
-        reason = (
-            f"{agreement.conflict:.0%} of the common walls lie on the other map's free space, "
-            f"expected at most {config.max_conflict:.0%}"
-        )
-        return Verdict.CONTRADICTED, reason, probability
-    # Rivals only matter to an alignment that would be convincing without them.
-    alone = probability_of(evidence, models, is_alone=True)
-    rival = rival_probability(evidence, models)
-    is_rivalled = rival > config.max_rival_probability or not is_probable
-    if is_rivalled and alone >= config.min_probability:
-        reason = (
-            f"another pose agrees as well where it overlaps: it would be right with probability "
-            f"{rival:.2f} if this one were not there; best score of another: "
-            f"{evidence.rival_share:.0%} of this one's"
-        )
-        return Verdict.AMBIGUOUS, reason, min(probability, 0.5)
-    numbers = (
-        f"{agreement.agreement:.0%} of the common walls agree, {agreement.conflict:.0%} conflict, "
-        f"overlap {agreement.overlap:.0%}, best rival {evidence.rival_share:.0%}, "
-        f"score {evidence.best.surprise:.1f} deviations above chance"
-    )
-    if not is_probable and _is_plain(evidence, config, models):
-        reason = (
-            f"what agrees are a few straight walls, as many places have them: right with "
-            f"probability {probability:.2f} only; {agreement.num_detail:.0f} cells of detail, "
-            + numbers
-        )
-        return Verdict.AMBIGUOUS, reason, probability
-    if not is_probable:
-        reason = f"right with probability {probability:.2f} only: {numbers}"
-        return Verdict.NOT_ENOUGH_OVERLAP, reason, probability
-    return Verdict.ACCEPTED, numbers, probability
+    """Verdict, its reason with the numbers that decided, and the pose's probability.
+
+    ``proof`` is None where the search is still to come, or of no interest.
+    """
+    case = _Case(evidence, config, models, proof or Proof())
+    rule = first_that_applies(_RULES, case)
+    reason = rule.sentence(case)
+    if rule.outcome is Verdict.ACCEPTED:
+        if not case.proof.is_optimum:
+            reason += f"; {case.higher}, but the maps speak for this one"
+        if not case.proof.is_complete:
+            reason += f"; {case.open_gap}"
+    return rule.outcome, reason, min(case.probability, rule.most_probability)
 
 
-def _is_plain(
-    evidence: MatchEvidence, config: GridRegistrationConfig, models: VerdictModels
-) -> bool:
-    """Whether the maps agree so well that with more detail the match would be accepted."""
-    agreement = evidence.best.agreement
-    detailed = replace(agreement, num_detail=max(agreement.num_detail, _ENOUGH_DETAIL))
-    richer = replace(evidence, best=replace(evidence.best, agreement=detailed))
-    return (
-        agreement.agreement >= _LIKE_SHARE
-        and probability_of(richer, models) >= config.min_probability
-    )
+def _not_finite(evidence: MatchEvidence, proof: Proof) -> Iterator[str]:
+    """What is not a finite number, with its value."""
+    numbers = [
+        ("the score some cells away", evidence.slide_share),
+        ("the number of poses searched", evidence.log_volume),
+        ("the score in the search", proof.score),
+        ("the lower bound", proof.lower_bound),
+        ("the upper bound", proof.upper_bound),
+    ]
+    for whose, pose in (("", evidence.best), *((" of a rival", r) for r in evidence.rivals)):
+        numbers += [(f"the score{whose}", pose.score), (f"the surprise{whose}", pose.surprise)]
+        for field in dataclasses.fields(pose.agreement):
+            numbers.append((f"{field.name}{whose}", getattr(pose.agreement, field.name)))
+    return (f"{name} is {value}" for name, value in numbers if not math.isfinite(value))

@@ -1,0 +1,180 @@
+"""Probability that a match of two maps is right, from measured quantities.
+
+The coefficients are fitted on simulated pairs by `study verdict`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from uw_dslam_ros2.core.registration.grids.agreement import Agreement
+
+__all__ = [
+    "ENOUGH_DETAIL",
+    "MATCH_FEATURES",
+    "MODELS",
+    "POSE_FEATURES",
+    "MatchEvidence",
+    "PoseEvidence",
+    "VerdictModels",
+    "match_features",
+    "pose_features",
+    "pose_logit",
+    "probability_of",
+    "rival_probability",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEvidence:
+    """What is known about one pose of two maps.
+
+    ``score`` is the objective on the finest level, ``surprise`` how far that on the searched level
+    lies above what chance alignments of these two maps reach, in standard deviations of such.
+    """
+
+    agreement: Agreement
+    score: float
+    surprise: float
+
+
+@dataclass(frozen=True, slots=True)
+class MatchEvidence:
+    """What is known about the best pose of two maps, the most convincing one, and its rivals.
+
+    ``slide_share`` is the score some cells off in the least curved direction over the best one.
+    ``log_volume`` is the logarithm of the number of poses that were searched: the more there are,
+    the better the best of them is by chance.
+    """
+
+    best: PoseEvidence
+    rivals: tuple[PoseEvidence, ...]
+    slide_share: float
+    log_volume: float
+
+    @property
+    def rival_share(self) -> float:
+        """Greatest score of a rival over the best pose's."""
+        most = max((rival.score for rival in self.rivals), default=0.0)
+        return max(most, 0.0) / max(self.best.score, 1e-9)
+
+
+ENOUGH_DETAIL = 600.0
+"""More cells of detail are no more proof: chance matches of large maps have them too."""
+_LIKE_DEVIATIONS = 2.0  # by how many standard errors a rival that is the true pose may agree less
+# Wall cells next to each other agree or not together: so many count as one (design effect, the
+# scatter of sums over squares against that of independent cells: 2.5 to 6 in noisy maps).
+_CELLS_PER_SAMPLE = 5.0
+_LEAST_VARIANCE = 0.005  # of one sample, as if one in two hundred disagreed
+_LIKE_DETAIL = 0.02  # how much of the best pose's detail it shows at least, sharing less area
+
+POSE_FEATURES = (
+    "agreement",
+    "conflict",
+    "log_detail",
+    "chance",
+    "log_surprise",
+    "log_volume",
+)
+MATCH_FEATURES = ("pose", "rival")
+_MOST_LOGIT = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictModels:
+    """Logistic models, intercept first: of a pose for itself, and of the best among rivals."""
+
+    pose: tuple[float, ...]
+    match: tuple[float, ...]
+
+
+MODELS = VerdictModels(
+    pose=(-2.1782, 5.6615, -18.5572, 0.9167, -6.7008, 0.819, -0.2288),
+    match=(0.3367, 0.7635, -1.1911),
+)
+"""Fitted by `study verdict` with its default settings, which prints them."""
+
+
+def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
+    """Quantities that speak for or against a pose by itself, as `POSE_FEATURES`."""
+    agreement = pose.agreement
+    return (
+        agreement.agreement,
+        agreement.conflict,
+        math.log1p(min(agreement.num_detail, ENOUGH_DETAIL)),
+        agreement.chance,
+        math.log(min(max(pose.surprise, 0.5), 30.0)),
+        log_volume,
+    )
+
+
+def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tuple[float, ...]:
+    """Logit of the best pose for itself, and how convincing its strongest rival is, from 0 up."""
+    best, *rivals = (
+        _logit(pose_model, pose_features(pose, evidence.log_volume))
+        for pose in (evidence.best, *_serious_rivals(evidence))
+    )
+    return best, math.log1p(math.exp(max(rivals))) if rivals else 0.0
+
+
+def _serious_rivals(evidence: MatchEvidence) -> list[PoseEvidence]:
+    """Rivals that may be the true pose of a place that looks like itself.
+
+    The true pose agrees as well as its twin, for the maps are the same, and in the same kind of
+    detail. What agrees significantly less is repeated walls: the best pose would have to agree
+    better by chance than the true one.
+    """
+    best = evidence.best.agreement
+    return [
+        rival
+        for rival in evidence.rivals
+        if _lead(best, rival.agreement) < _LIKE_DEVIATIONS
+        and rival.agreement.num_detail >= _LIKE_DETAIL * best.num_detail
+    ]
+
+
+def probability_of(
+    evidence: MatchEvidence, models: VerdictModels = MODELS, *, is_alone: bool = False
+) -> float:
+    """Probability in [0, 1] that the best pose is right, of models fitted on simulated pairs.
+
+    ``is_alone`` leaves the rivals out.
+    """
+    if is_alone:
+        evidence = replace(evidence, rivals=())
+    logit = _logit(models.match, match_features(evidence, models.pose))
+    return 1.0 / (1.0 + math.exp(-logit))
+
+
+def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MODELS) -> float:
+    """Logit that a pose is right, from what speaks for it by itself."""
+    return _logit(models.pose, pose_features(pose, log_volume))
+
+
+def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
+    """How probable the most convincing serious rival would be if the best pose were not there."""
+    return max(
+        (
+            probability_of(replace(evidence, best=rival), models, is_alone=True)
+            for rival in _serious_rivals(evidence)
+        ),
+        default=0.0,
+    )
+
+
+def _lead(best: Agreement, rival: Agreement) -> float:
+    """By how many standard errors one pose agrees better than another."""
+    variance = 0.0
+    for pose in (best, rival):
+        one = max(pose.agreement * (1.0 - pose.agreement), _LEAST_VARIANCE)
+        variance += one / max(pose.num_walls / _CELLS_PER_SAMPLE, 1.0)
+    return (best.agreement - rival.agreement) / math.sqrt(variance)
+
+
+def _logit(model: Sequence[float], features: Sequence[float]) -> float:
+    logit = model[0] + sum(c * x for c, x in zip(model[1:], features, strict=True))
+    if math.isnan(logit):
+        return -_MOST_LOGIT  # what is not a number speaks for nothing
+    return max(-_MOST_LOGIT, min(_MOST_LOGIT, logit))
