@@ -13,7 +13,11 @@ from uw_dslam_ros2.core.registration import (
     Verdict,
     register_point_sets,
 )
-from uw_dslam_ros2.core.registration.points.verdict import PoseHypothesis, decide_points
+from uw_dslam_ros2.core.registration.points.verdict import (
+    PointCase,
+    PoseHypothesis,
+    decide_points,
+)
 from uw_dslam_ros2.core.se2 import SE2
 
 PLANTED = SE2(0.4, -0.7, 2.2)
@@ -70,7 +74,7 @@ def test_unrelated_sets_are_refused():
     rng = np.random.default_rng(4)
     for _ in range(5):
         result = register_point_sets(rng.uniform(-1, 1, (40, 2)), rng.uniform(-1, 1, (40, 2)))
-        assert result.verdict is Verdict.NOT_ENOUGH_OVERLAP, result.reason
+        assert result.verdict is Verdict.IMPROBABLE, result.reason
         assert result.probability < 0.95
 
 
@@ -216,10 +220,7 @@ def test_a_convincing_rival_counts_as_much_as_the_points_prefer_it():
             PoseHypothesis(evidence, 1e-6 * np.eye(3), evidence, 0.9, odds)
             for evidence, odds in ((80.0, -math.inf), (rival_evidence, log_odds))
         ]
-        return decide_points(
-            poses, is_complete=True, gap=0.01, spacing_m=0.1, arm_m=1.0, is_line=False,
-            min_probability=0.95,
-        )  # fmt: skip
+        return decide_points(PointCase(poses, True, 0.01, 0.1, 1.0, False, 0.95))
 
     # By the points' scatter either could have won, however many nats lie between them.
     assert verdict(math.log(0.5), 70.0)[0] is Verdict.AMBIGUOUS

@@ -38,8 +38,8 @@ class RegistrationConfig(Config):
         0.5, 0.01, 0.99, "share of source points without partner that the search assumes"
     )
     min_points: int = setting(4, 2, 1000, "fewer points on either side are refused")
-    min_probability: float = setting(
-        0.95, 0.5, 1.0, "probability of the transform being right, below which it is refused"
+    min_posterior: float = setting(
+        0.95, 0.5, 0.999999, "least posterior of an accepted pose, against chance and other poses"
     )
     max_rivals: int = setting(8, 0, 1000, "other poses reported")
     nnde_neighbors: int = setting(

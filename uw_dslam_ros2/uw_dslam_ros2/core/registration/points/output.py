@@ -16,6 +16,7 @@ from uw_dslam_ros2.core.registration.points.input import Cloud, Pair
 from uw_dslam_ros2.core.registration.points.refinement import Refinement
 from uw_dslam_ros2.core.registration.points.rivals import log_contributions, log_odds
 from uw_dslam_ros2.core.registration.points.verdict import (
+    PointCase,
     PoseHypothesis,
     decide_points,
     posterior,
@@ -63,14 +64,18 @@ def packed(
     gap = max(0.0, 1.0 - lower / upper) if upper > 0.0 else 0.0
     covariance = evidence.repetition * best.covariance()
     verdict, reason, probability = decide_points(
-        _hypotheses(candidates, evidence, config.min_probability),
-        is_complete=outcome.status is Status.CERTIFIED,
-        gap=gap,
-        spacing_m=evidence.spacing_m,
-        arm_m=evidence.arm_m,
-        is_line=_is_line(evidence.source) and _is_line(evidence.target),
-        min_probability=config.min_probability,
+        PointCase(
+            _hypotheses(candidates, evidence, config.min_posterior),
+            is_complete=outcome.status is Status.CERTIFIED,
+            gap=gap,
+            spacing_m=evidence.spacing_m,
+            arm_m=evidence.arm_m,
+            is_line=_is_line(evidence.source) and _is_line(evidence.target),
+            min_posterior=config.min_posterior,
+        )
     )
+    if verdict is Verdict.TOO_FEW_FEATURES:
+        return _undecided(pair.caller_points(), reason, seconds)
     pose = pair.full_pose(best.pose())
     source_points, target_points = pair.caller_points()
     is_inlier = _has_partner(pose.apply(source_points), target_points, best, evidence.spacing_m)
@@ -99,7 +104,7 @@ def packed(
 
 
 def _hypotheses(
-    candidates: Sequence[Candidate], evidence: EvidenceModel, min_probability: float
+    candidates: Sequence[Candidate], evidence: EvidenceModel, min_posterior: float
 ) -> list[PoseHypothesis]:
     """What the verdict asks of the poses, the best first."""
     area_m2 = evidence.target_outline.area_m2
@@ -110,11 +115,11 @@ def _hypotheses(
 
     found: list[PoseHypothesis] = []
     first: FloatArray | None = None
-    is_poor = posterior([candidates[0][0]]) < min_probability
+    is_poor = posterior([candidates[0][0]]) < min_posterior
     for k, (own, refinement) in enumerate(candidates):
         odds = -math.inf
         # Only a rival that convinces by itself counts, or any where the best does not.
-        if 0 < k < _MAX_COMPARED and (is_poor or posterior([own]) >= min_probability):
+        if 0 < k < _MAX_COMPARED and (is_poor or posterior([own]) >= min_posterior):
             first = contributions(candidates[0][1]) if first is None else first
             odds = log_odds(first, contributions(refinement), evidence.repetition)
         is_independent = evidence.repetition == 1.0
@@ -173,13 +178,15 @@ def too_few(
     """Answer to sets that no pose can be told from."""
     m, n = len(source.points), len(target.points)
     reason = f"{m} source and {n} target points, at least {config.min_points} of each needed"
+    return _undecided((source.original(), target.original()), reason, seconds)
+
+
+def _undecided(
+    points: tuple[FloatArray, FloatArray], reason: str, seconds: float
+) -> RegistrationResult:
+    source, target = points
     refused = RegistrationResult.refused(
-        Verdict.TOO_FEW_FEATURES, reason, seconds=seconds, num_points=(m, n)
+        Verdict.TOO_FEW_FEATURES, reason, seconds=seconds, num_points=(len(source), len(target))
     )
-    points = source.original(), target.original()
-    return replace(
-        refused,
-        source_points=points[0],
-        target_points=points[1],
-        is_inlier=np.zeros(m, dtype=np.bool_),
-    )
+    nowhere = np.zeros(len(source), dtype=np.bool_)
+    return replace(refused, source_points=source, target_points=target, is_inlier=nowhere)
