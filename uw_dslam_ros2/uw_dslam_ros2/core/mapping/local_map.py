@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import MatchConfig
-from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Match, Prior, match_points, thin
+from uw_dslam_ros2.core.mapping.matcher import (
+    LikelihoodField,
+    Prior,
+    ScanMatch,
+    match_points,
+    thin,
+)
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["LocalMap"]
@@ -45,7 +51,7 @@ class LocalMap:
         if self._last is not None:
             self._last = T_new_old @ self._last
 
-    def match(self, points: FloatArray, weight: FloatArray, prior: Prior) -> Match | None:
+    def match(self, points: FloatArray, weight: FloatArray, prior: Prior) -> ScanMatch | None:
         """Match a ping's echoes (N, 2) in base_link; None where there is too little to match."""
         config = self._config
         if len(points) < _MIN_POINTS or not self._pings:

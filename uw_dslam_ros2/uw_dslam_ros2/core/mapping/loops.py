@@ -11,8 +11,8 @@ from uw_dslam_ros2.core.mapping.config import LoopConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.graph import SubmapGraph
 from uw_dslam_ros2.core.mapping.matcher import (
     LikelihoodField,
-    Match,
     Prior,
+    ScanMatch,
     match_points,
     thin,
 )
@@ -119,7 +119,7 @@ def _verified(
 def _agreed(
     target: ClosedSection,
     source: ClosedSection,
-    guess: Match,
+    guess: ScanMatch,
     window: PriorWindow,
     config: VehicleMapperConfig,
 ) -> SE2 | None:
@@ -146,7 +146,7 @@ def _agreed(
 
 
 def _is_sure(
-    guess: Match, target: ClosedSection, source: ClosedSection, config: VehicleMapperConfig
+    guess: ScanMatch, target: ClosedSection, source: ClosedSection, config: VehicleMapperConfig
 ) -> bool:
     """Whether overlap, lead over other poses and the water between the walls say so."""
     if guess.overlap < config.loop.sure_overlap or guess.lead < _SURE_LEAD:
@@ -167,7 +167,7 @@ def _matched(
     prior: Prior,
     half_width: tuple[float, float, float],
     config: VehicleMapperConfig,
-) -> Match:
+) -> ScanMatch:
     """Match of points with points within a window, from coarse to fine."""
     fine = config.match.sigma_m
     sigmas = [float(np.clip(max(half_width[:2]) / 8.0, 2.0 * fine, _COARSEST * fine))]

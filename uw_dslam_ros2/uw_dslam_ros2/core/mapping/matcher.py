@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.mapping.match_kernels import score_poses, score_window, splat
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["LikelihoodField", "Match", "Prior", "match_points", "thin"]
+__all__ = ["LikelihoodField", "Prior", "ScanMatch", "match_points", "thin"]
 
 FloatArray = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ class Prior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Match:
+class ScanMatch:
     """Outcome of one match; the caller decides whether to believe it.
 
     ``information`` (3, 3) comes from the score's curvature alone, without the prior: it is
@@ -131,7 +131,7 @@ def match_points(
     prior: Prior,
     half_width: tuple[float, float, float],
     information_share: float,
-) -> Match:
+) -> ScanMatch:
     """Find ``T_target_source`` near a prior.
 
     Parameters
@@ -195,7 +195,7 @@ def match_points(
     )
     T_target_source = SE2.from_array(pose)
     single = field.values_at(T_target_source.apply(source))
-    return Match(
+    return ScanMatch(
         T_target_source,
         information,
         float(np.mean(single > _MEETS)),
