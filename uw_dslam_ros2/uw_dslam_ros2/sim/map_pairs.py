@@ -134,9 +134,9 @@ def damage(values: Values, noise: MapNoise, rng: np.random.Generator) -> Values:
     if noise.bend_cells > 0.0:
         result = _bend(result, noise.bend_cells, rng)
     rows, cols = np.nonzero(result == OCCUPIED)
-    chance = rng.random(len(rows))
-    is_wiped = chance < noise.wiped
-    is_moved = (chance >= noise.wiped) & (chance < noise.wiped + noise.moved)
+    draw = rng.random(len(rows))
+    is_wiped = draw < noise.wiped
+    is_moved = (draw >= noise.wiped) & (draw < noise.wiped + noise.moved)
     for selection in (is_wiped, is_moved):
         result[rows[selection], cols[selection]] = FREE
     steps = rng.integers(-1, 2, (int(is_moved.sum()), 2))

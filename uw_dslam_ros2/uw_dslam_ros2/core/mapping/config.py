@@ -78,24 +78,6 @@ class LoopConfig(Config):
 
     is_enabled: bool = setting(True, doc="close loops inside the vehicle")
     max_candidates: int = setting(4, 0, 1000, "earlier submaps tried for each new one")
-    search_sigma: float = setting(
-        3.0, 0.5, 10.0, "search window in standard deviations of the graph"
-    )
-    max_window_m: float = setting(15.0, 0.1, 1e3, "largest half width of the search window [m]")
-    max_window_rad: float = setting(
-        0.35, 0.01, 3.2, "largest half width of the search window in yaw [rad]"
-    )
-    min_overlap: float = setting(
-        0.3, 0.0, 1.0, "share of the points that must meet the other map to refine its pose"
-    )
-    sure_overlap: float = setting(
-        0.5, 0.0, 1.0, "that share, where the engine finds the same pose but does not accept it"
-    )
-    max_conflict: float = setting(
-        0.2, 0.0, 1.0, "particles: share of the points on free water above which nothing matches"
-    )
-    min_points: int = setting(60, 3, 100000, "submaps with fewer points are not matched")
-    max_points: int = setting(600, 10, 100000, "points of a submap that are matched")
 
 
 @dataclass(frozen=True, slots=True)

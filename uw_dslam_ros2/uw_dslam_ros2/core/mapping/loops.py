@@ -22,9 +22,30 @@ from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfi
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["find_loops", "nearby", "with_bend"]
+__all__ = [
+    "MAX_WINDOW_M",
+    "MAX_WINDOW_RAD",
+    "MIN_OVERLAP",
+    "MIN_POINTS",
+    "SEARCH_SIGMA",
+    "find_loops",
+    "nearby",
+    "with_bend",
+]
 
 FloatArray = NDArray[np.float64]
+
+SEARCH_SIGMA = 3.0
+"""Half width of the search window, in standard deviations of the graph ..."""
+MAX_WINDOW_M, MAX_WINDOW_RAD = 15.0, 0.35
+"""... but at most this: beyond it a wrong place is found more often than a lost one."""
+MIN_POINTS = 60
+"""Submaps with fewer points than this show too little to be told from others."""
+MIN_OVERLAP = 0.3
+"""Least share of the points that must meet the other map."""
+_SURE_OVERLAP = 0.5
+"""That share, where the engine finds the same pose but does not accept it."""
+_MAX_POINTS = 600
 # A match takes a submap as rigid; on average half of its own drift lies between its points.
 _BEND_SHARE = 0.25
 _DIGITS = 6
@@ -42,7 +63,7 @@ def find_loops(
 ) -> bool:
     """Match the newest closed submap with earlier ones near it; True if the graph moved."""
     source = len(sections) - 1
-    if len(sections[source].points) < config.loop.min_points:
+    if len(sections[source].points) < MIN_POINTS:
         return False
     found = False
     for target in nearby(sections, graph.poses, source, config.loop):
@@ -70,7 +91,7 @@ def nearby(
     here = poses[source].apply(sections[source].center)
     scored = []
     for target in range(source - 1):
-        if len(sections[target].points) < config.min_points:
+        if len(sections[target].points) < MIN_POINTS:
             continue
         distance = float(np.linalg.norm(poses[target].apply(sections[target].center) - here))
         reach = 0.7 * (sections[target].radius_m + sections[source].radius_m) + slack_m
@@ -90,10 +111,10 @@ def _verified(
     but finds the same pose as a matcher that is sure, the two together are enough. Where the same
     walls would fit a period further, only what lies across the periods is believed.
     """
-    loop, fine = config.loop, config.match.sigma_m
-    sigma = np.sqrt(np.diag(prior.covariance)) * loop.search_sigma
-    half_width_m = np.clip(sigma[:2], 2.0 * fine, loop.max_window_m)
-    half_width_rad = float(np.clip(sigma[2], 0.05, loop.max_window_rad))
+    fine = config.match.sigma_m
+    sigma = np.sqrt(np.diag(prior.covariance)) * SEARCH_SIGMA
+    half_width_m = np.clip(sigma[:2], 2.0 * fine, MAX_WINDOW_M)
+    half_width_rad = float(np.clip(sigma[2], 0.05, MAX_WINDOW_RAD))
     half_width = (float(half_width_m[0]), float(half_width_m[1]), half_width_rad)
     guess = _matched(target, source, prior, half_width, config)
     if guess.overlap < _HOPELESS:
@@ -106,7 +127,7 @@ def _verified(
         return None
     near = Prior(T_target_source, np.diag([fine, fine, _NEAR_RAD]) ** 2)
     match = _matched(target, source, near, (4.0 * fine, 4.0 * fine, 2.0 * _NEAR_RAD), config)
-    if match.overlap < loop.min_overlap:
+    if match.overlap < MIN_OVERLAP:
         return None
     rotation = np.eye(3)
     rotation[:2, :2] = match.T_target_source.rotation()
@@ -138,18 +159,16 @@ def _agreed(
         # The engine's last digits depend on how memory is aligned; the mapper's must not.
         return SE2.from_array(np.round(found.as_array(), _DIGITS))
     # Whether the walls would fit elsewhere too is asked below, where the prior has its say.
-    if judged.verdict not in _OPEN or not _is_sure(guess, target, source, config):
+    if judged.verdict not in _OPEN or not _is_sure(guess, target, source):
         return None
     distance, turn = found.distance_to(guess.T_target_source)
     is_same = distance <= 3.0 * config.match.sigma_m and turn <= _NEAR_RAD
     return guess.T_target_source if is_same else None
 
 
-def _is_sure(
-    guess: ScanMatch, target: ClosedSection, source: ClosedSection, config: VehicleMapperConfig
-) -> bool:
+def _is_sure(guess: ScanMatch, target: ClosedSection, source: ClosedSection) -> bool:
     """Whether overlap, lead over other poses and the water between the walls say so."""
-    if guess.overlap < config.loop.sure_overlap or guess.lead < _SURE_LEAD:
+    if guess.overlap < _SURE_OVERLAP or guess.lead < _SURE_LEAD:
         return False
     there = conflict(target.evidence, source.points, guess.T_target_source)
     back = conflict(source.evidence, target.points, guess.T_target_source.inverse())
@@ -175,7 +194,7 @@ def _matched(
         sigmas.append(max(0.5 * sigmas[-1], fine))
     fields = [LikelihoodField(target.points, target.weight, s) for s in sigmas]
     points, weight = thin(source.points, 1.0 - np.exp(-source.weight), fine)
-    stride = max(1, -(-len(points) // config.loop.max_points))
+    stride = max(1, -(-len(points) // _MAX_POINTS))
     # The window already says where to look; inside it the prior only breaks ties, so it is wide.
     spread = prior.covariance * 4.0 + np.diag([fine**2, fine**2, 1e-4])
     return match_points(

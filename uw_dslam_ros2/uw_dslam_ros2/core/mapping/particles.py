@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.covariances import rotated_covariance
-from uw_dslam_ros2.core.mapping.loops import nearby, with_bend
+from uw_dslam_ros2.core.mapping.loops import (
+    MAX_WINDOW_M,
+    MAX_WINDOW_RAD,
+    MIN_OVERLAP,
+    MIN_POINTS,
+    SEARCH_SIGMA,
+    nearby,
+    with_bend,
+)
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.mapping.occupancy import SparseEvidence
 from uw_dslam_ros2.core.mapping.rivals import conflict
@@ -23,6 +31,8 @@ _MIN_EFFECTIVE_SHARE = 0.5
 """Resampling where the effective number of particles falls below this share of all."""
 _MAX_POINTS = 250
 """Points of a submap that are matched, for each particle."""
+_MAX_CONFLICT = 0.2
+"""Share of the points on free water above which a particle's place is not matched."""
 _FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 
 
@@ -130,7 +140,7 @@ class ParticleFilter:
     def _candidates(self, sections: list[ClosedSection]) -> list[int]:
         """Earlier submaps, not the neighbour, that the newest may overlap; the nearest first."""
         config, newest = self._config.loop, len(sections) - 1
-        if not config.is_enabled or len(sections[newest].points) < config.min_points:
+        if not config.is_enabled or len(sections[newest].points) < MIN_POINTS:
             return []
         slack_m = 2.0 * math.sqrt(float(np.linalg.eigvalsh(self.covariance()[:2, :2])[-1]))
         return nearby(sections, self.poses, newest, config, slack_m)
@@ -160,11 +170,11 @@ class ParticleFilter:
         points = np.vstack([pose.apply(sections[t].points) for pose, t in pairs])
         weight = np.concatenate([sections[t].weight for t in targets])
         fine = config.match.sigma_m
-        sigma = np.sqrt(np.diag(covariance)) * config.loop.search_sigma
+        sigma = np.sqrt(np.diag(covariance)) * SEARCH_SIGMA
         half_width = (
-            float(np.clip(sigma[0], 2.0 * fine, config.loop.max_window_m)),
-            float(np.clip(sigma[1], 2.0 * fine, config.loop.max_window_m)),
-            float(np.clip(sigma[2], 0.02, config.loop.max_window_rad)),
+            float(np.clip(sigma[0], 2.0 * fine, MAX_WINDOW_M)),
+            float(np.clip(sigma[1], 2.0 * fine, MAX_WINDOW_M)),
+            float(np.clip(sigma[2], 0.02, MAX_WINDOW_RAD)),
         )
         fields = [LikelihoodField(points, weight, s) for s in (2.0 * fine, fine)]
         source, support = thin(newest.points, 1.0 - np.exp(-newest.weight), fine)
@@ -173,7 +183,7 @@ class ParticleFilter:
             fields, source[::stride], support[::stride], Prior(step, covariance), half_width,
             config.match.information_share,
         )  # fmt: skip
-        if match.overlap < config.loop.min_overlap:
+        if match.overlap < MIN_OVERLAP:
             return None
         against = 0.0
         for pose, index in pairs:
@@ -182,7 +192,7 @@ class ParticleFilter:
             mine, theirs = grids[len(sections) - 1], sections[index].points
             back = conflict(mine, theirs, T_target_source.inverse())
             against = max(against, there, back)
-        if against > config.loop.max_conflict:
+        if against > _MAX_CONFLICT:
             return None
         information = with_bend(match.information, rotated_covariance(newest.drift, step.yaw))
         fit = match.score - against

@@ -212,10 +212,10 @@ class MapQueueManager(Node):
                     self._subscribe(topic)
 
     def _ask(self) -> None:
-        room = self._servers.room()
-        if room <= 0:
+        num_free = self._servers.num_free()
+        if num_free <= 0:
             return
-        for request in self._queue.next_requests(room):
+        for request in self._queue.next_requests(num_free):
             # A server's own time limit would let a busy machine refuse what a quiet one accepts;
             # the number of boxes decides, and this is for what never ends.
             max_seconds = _SEARCH_SHARE * self._config.request_timeout_s

@@ -40,7 +40,7 @@ class _Server:
 
 
 class RegistrationClients:
-    """Asks whichever server has room; all methods belong to one thread.
+    """Asks whichever server has a place; all methods belong to one thread.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class RegistrationClients:
         """Servers on the graph now."""
         return len(self._ready())
 
-    def room(self) -> int:
+    def num_free(self) -> int:
         """How many requests can be asked now."""
         now_s = time.monotonic()
         return sum(
@@ -112,7 +112,7 @@ class RegistrationClients:
         request: RegisterMaps.Request,
         on_answer: Callable[[int, RegisterMaps.Response], None],
     ) -> bool:
-        """Ask the server with most room; `on_answer` is called in the owning thread.
+        """Ask the server with most free places; `on_answer` is called in the owning thread.
 
         False when there is none; a server that says BUSY is left alone for a while, and its
         answer comes through all the same.
