@@ -11,6 +11,7 @@ from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.merging import MapQueueConfig
+from uw_dslam_ros2.core.registration import RegistrationConfig
 from uw_dslam_ros2.io.settings import REMOVED, SettingsFile
 
 
@@ -125,7 +126,11 @@ def test_setting_of_an_earlier_version_is_refused_by_what_became_of_it(tmp_path)
 @pytest.mark.parametrize("name", sorted(REMOVED))
 def test_removed_settings_are_removed(name):
     group, _, rest = name.partition(".")
-    settings = {"mapper": VehicleMapperConfig(), "queue": MapQueueConfig()}
+    settings = {
+        "mapper": VehicleMapperConfig(),
+        "queue": MapQueueConfig(),
+        "points": RegistrationConfig(),
+    }
     inner = settings[group].to_dict() if rest else {}
     for part in rest.split("."):
         assert part not in inner or isinstance(inner[part], dict)

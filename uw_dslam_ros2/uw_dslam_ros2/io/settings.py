@@ -53,6 +53,7 @@ REMOVED = {
     "mapper.loop.max_points": "it is always 600",
     "mapper.particles.min_effective_share": "it is always 0.5",
     "mapper.particles.max_points": "it is always 250",
+    "points.min_probability": "it is points.min_posterior now",
     "queue.log_odds_max": "it is always 8",
     "queue.num_neighbours": "it is always 1",
     "queue.max_checks": "it is always 3",
@@ -244,8 +245,7 @@ def _check_types(label: str, name: str, config_type: type[Config], values: Any) 
         field = next((field for field in fields(config_type) if field.name == key), None)
         if field is None and f"{name}.{key}" in REMOVED:
             raise ConfigError(
-                f"{label}: {name}.{key} is no setting any more; {REMOVED[f'{name}.{key}']}: "
-                "leave it out"
+                f"{label}: {name}.{key} is no setting any more; {REMOVED[f'{name}.{key}']}"
             )
         if field is None:
             known = [field.name for field in fields(config_type)]

@@ -123,9 +123,7 @@ def refuse_unknown_parameters(node: Node) -> None:
         ):
             continue
         if name in REMOVED:
-            raise ConfigError(
-                f"parameter {name} is no setting any more; {REMOVED[name]}: leave it out"
-            )
+            raise ConfigError(f"parameter {name} is no setting any more; {REMOVED[name]}")
         raise ConfigError(
             f"parameter {name} is unknown to {node.get_name()}; {_nearest(name, _declared(node))}"
         )
