@@ -57,21 +57,21 @@ def test_windows_share_the_asked_part_of_their_area(overlap):
     assert inside.mean() == pytest.approx(overlap, abs=0.03)
 
 
-def test_pairs_of_two_places_and_twins_have_no_answer():
+def test_pairs_of_two_places_and_aliases_have_no_answer():
     assert (
         make_pair("lake", 0.5, "clean", 1, size_cells=120, is_matching=False).T_target_source
         is None
     )
-    twin = make_pair("basin", 0.7, "clean", 1, size_cells=120, is_twin=True)
-    assert twin.T_target_source is None
-    assert twin.is_ambiguous
+    alias = make_pair("basin", 0.7, "clean", 1, size_cells=120, is_alias=True)
+    assert alias.T_target_source is None
+    assert alias.is_ambiguous
 
 
 def test_the_windows_of_a_twin_look_alike():
     """A half turn about the basin's middle lays one end on the other."""
     plain = make_pair("basin", 0.7, "clean", 2, size_cells=120)
-    twin = make_pair("basin", 0.7, "clean", 2, size_cells=120, is_twin=True)
-    is_wall = [m.values == OCCUPIED for m in (plain.target, twin.target)]
+    alias = make_pair("basin", 0.7, "clean", 2, size_cells=120, is_alias=True)
+    is_wall = [m.values == OCCUPIED for m in (plain.target, alias.target)]
     near = cv2.dilate(is_wall[0].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     assert near[is_wall[1]].mean() > 0.9
 
@@ -120,7 +120,7 @@ def test_wrong_arguments_are_named():
     with pytest.raises(InvalidInputError, match="loud"):
         make_pair("lake", 0.5, "loud", 0)
     with pytest.raises(InvalidInputError, match="basin"):
-        make_pair("lake", 0.5, "clean", 0, is_twin=True)
+        make_pair("lake", 0.5, "clean", 0, is_alias=True)
     with pytest.raises(InvalidInputError, match="wiped"):
         MapNoise(wiped=1.5)
     assert math.isfinite(MapNoise().bend_cells)

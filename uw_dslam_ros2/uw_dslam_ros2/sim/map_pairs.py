@@ -284,28 +284,28 @@ def make_pair(
     resolution_m: float = 0.05,
     is_matching: bool = True,
     is_sonar: bool = False,
-    is_twin: bool = False,
+    is_alias: bool = False,
 ) -> MapPair:
     """A pair of a generated place; same arguments, same pair.
 
     ``is_sonar`` observes the place twice, each time with few narrow looks and dropped beams, so
     that the maps have holes and see different things; otherwise both windows are cut from one good
-    map. ``is_twin`` puts one window where the place, seen after a half turn, looks like what the
+    map. ``is_alias`` puts one window where the place, seen after a half turn, looks like what the
     other window shows, so that the pair seems to match and does not (kind basin only).
 
     Raises
     ------
     InvalidInputError
-        For an unknown kind or noise, or a twin of a place that has none.
+        For an unknown kind or noise, or an alias of a place that has none.
     """
     if noise not in NOISES:
         raise InvalidInputError(f"noise is {noise!r}, expected one of {', '.join(NOISES)}")
-    if is_twin and kind != "basin":
-        raise InvalidInputError(f"kind is {kind!r}, expected basin: others have no twin")
+    if is_alias and kind != "basin":
+        raise InvalidInputError(f"kind is {kind!r}, expected basin: others have no alias")
     rng = np.random.default_rng((seed, sum(kind.encode()), size_cells))
     world_cells = int(size_cells * 2.4)
     solid = make_place(kind, world_cells, rng)
-    other = solid if is_matching or is_twin else make_place(kind, world_cells, rng)
+    other = solid if is_matching or is_alias else make_place(kind, world_cells, rng)
     reach = size_cells * 0.9
     if is_sonar:
         looks = {"num_views": 90, "view_rad": math.radians(130.0), "dropout": 0.15}
@@ -321,13 +321,13 @@ def make_pair(
     windows = None
     if kind == "basin":
         windows = _windows_at_an_end(world_cells, size_cells, overlap, rng)
-        if is_twin:
+        if is_alias:
             half_turn = SE2(float(world_cells), float(world_cells), math.pi)
             windows = (windows[0], half_turn @ windows[1])
     pair = cut_pair(
         values_a, values_b, kind, overlap, noise, rng,
         size_cells=size_cells, resolution_m=resolution_m,
-        is_matching=is_matching and not is_twin, T_world_windows=windows,
+        is_matching=is_matching and not is_alias, T_world_windows=windows,
     )  # fmt: skip
     return replace(pair, is_ambiguous=kind in ("symmetric", "basin"))
 

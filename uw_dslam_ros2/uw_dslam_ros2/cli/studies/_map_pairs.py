@@ -37,7 +37,7 @@ class PairSpec:
     seed: int
     is_matching: bool = True
     is_sonar: bool = False
-    is_twin: bool = False
+    is_alias: bool = False
     size_cells: int = 260
 
     def make(self) -> MapPair:
@@ -49,7 +49,7 @@ class PairSpec:
             self.seed,
             is_matching=self.is_matching,
             is_sonar=self.is_sonar,
-            is_twin=self.is_twin,
+            is_alias=self.is_alias,
             size_cells=self.size_cells,
         )
 

@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _specs(kinds: Iterable[str], overlaps: Iterable[float], seeds: range) -> Iterator[PairSpec]:
-    """Pairs of all kinds, overlaps and noises; some again with maps of two places, or of twins."""
+    """Pairs of all kinds, overlaps and noises; some again of two places, or of aliases."""
     for seed in seeds:
         for kind in kinds:
             rng = np.random.default_rng((seed, sum(kind.encode())))
@@ -125,8 +125,8 @@ def _specs(kinds: Iterable[str], overlaps: Iterable[float], seeds: range) -> Ite
                     other = rng.random() < 0.6
                     yield PairSpec(kind, overlap, noise, seed, True, is_sonar, False, size)
                     if other:
-                        is_twin = kind == "basin"
-                        yield PairSpec(kind, overlap, noise, seed, False, is_sonar, is_twin, size)
+                        is_alias = kind == "basin"
+                        yield PairSpec(kind, overlap, noise, seed, False, is_sonar, is_alias, size)
 
 
 def _gathered(path: Path, specs: Iterable[PairSpec]) -> list[_Trial]:
@@ -213,7 +213,7 @@ def _groups(trials: list[_Trial]) -> dict[str, list[_Trial]]:
 
     def group(trial: _Trial) -> str:
         spec = trial.spec
-        if spec.is_twin:
+        if spec.is_alias:
             return "like ends of one basin"
         if not spec.is_matching:
             return "different places"

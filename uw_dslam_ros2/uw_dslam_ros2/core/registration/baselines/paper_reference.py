@@ -263,7 +263,7 @@ def register_reference(
     xi: list[tuple[float, int, float, float, float, float, float]] = []
     num_boxes = 1
     first = float(lower_bound(pair, box)[0])
-    heapq.heappush(xi, (first, 0, *_packed(box, 0)))
+    heapq.heappush(xi, (first, 0, *_heap_entry(box, 0)))
     history = [(first, upper)]
     is_converged = False
     while xi:  # line 3, a loop
@@ -272,7 +272,7 @@ def register_reference(
         if is_converged or len(history) > max_iterations:
             break
         parent = heapq.heappop(xi)  # line 4: the box of least R_L ...
-        children = _unpacked(parent).split()  # ... in eight; it leaves xi (line 5)
+        children = _box_of_entry(parent).split()  # ... in eight; it leaves xi (line 5)
         values, bounds = upper_bound(pair, children), lower_bound(pair, children)
         # A child lies inside its parent, whose bound holds for it too.
         bounds = np.maximum(bounds, parent[0])
@@ -280,7 +280,9 @@ def register_reference(
         if values[k] < upper:  # lines 7 and 8
             upper, best = float(values[k]), children.centre(k)
         for i in np.flatnonzero(bounds <= upper):  # line 11: others cannot hold the optimum
-            heapq.heappush(xi, (float(bounds[i]), num_boxes + int(i), *_packed(children, int(i))))
+            heapq.heappush(
+                xi, (float(bounds[i]), num_boxes + int(i), *_heap_entry(children, int(i)))
+            )
         num_boxes += len(bounds)
         history.append((min(xi[0][0], upper) if xi else upper, upper))  # line 6
         if on_iteration is not None and on_iteration(len(history) - 1, *history[-1]):
@@ -325,12 +327,12 @@ def _rotated(points: FloatArray, theta: ArrayLike) -> FloatArray:
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=2)
 
 
-def _packed(boxes: Boxes, i: int) -> tuple[float, float, float, float, float]:
+def _heap_entry(boxes: Boxes, i: int) -> tuple[float, float, float, float, float]:
     tx, ty = boxes.t[i]
     return float(boxes.theta[i]), float(tx), float(ty), boxes.beta_rad, boxes.half_side_m
 
 
-def _unpacked(entry: tuple[float, int, float, float, float, float, float]) -> Boxes:
+def _box_of_entry(entry: tuple[float, int, float, float, float, float, float]) -> Boxes:
     _, _, theta, tx, ty, beta, half = entry
     return Boxes(np.array([theta]), np.array([[tx, ty]]), beta, half)
 
