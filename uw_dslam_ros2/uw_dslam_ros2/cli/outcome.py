@@ -81,7 +81,7 @@ class RegistrationRow:
             names_of(answer.match.source.ids),
             names_of(answer.match.target.ids),
             answer.verdict.name,
-            answer.reason,
+            answer.why,
             is_used,
             x,
             y,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,13 +12,16 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
+from uw_dslam_ros2.core.registration.rules import Rule, first_that_applies
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["Answer", "AnswerBook", "Match", "MatchKey"]
+__all__ = ["Answer", "AnswerBook", "Match", "MatchKey", "Use"]
 
 FloatArray = NDArray[np.float64]
 
-_GUESSES = Verdict.ACCEPTED, Verdict.NOT_ENOUGH_OVERLAP, Verdict.IMPROBABLE
+# Refused for want of evidence, not because something speaks against the pose.
+_UNSURE = Verdict.NOT_ENOUGH_OVERLAP, Verdict.IMPROBABLE
+_WORTH_ASKING = 0.5  # probability from which an unsure pose is
 
 MatchKey = tuple[bytes, bytes, tuple[float, ...]]
 """Source unit, target unit, prior: equal keys are the same question and get the same answer."""
@@ -37,9 +41,24 @@ class Match:
         return self.source.key, self.target.key, _prior_key(self.prior)
 
 
+class Use(enum.IntEnum):
+    """What the queue does with an answer; each one may do what those before it may."""
+
+    NOTHING = 0
+    VOTE = 1
+    """Speaks for other answers that agree with it, and is believed if enough of them do."""
+    CLAIM = 2
+    """Is worth asking others about."""
+    EDGE = 3
+    """Is believed by itself, as long as those others do not contradict it."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What is kept of a `RegistrationResult`, with the question."""
+    """What is kept of a `RegistrationResult`, with the question, and what is done with it.
+
+    ``why`` is the reason for that: the result's own, or what the queue has against it.
+    """
 
     match: Match
     verdict: Verdict
@@ -48,6 +67,13 @@ class Answer:
     covariance: FloatArray
     probability: float
     numbers: dict[str, float] = field(default_factory=dict)  # of the result, for reports
+    use: Use = field(init=False)
+    why: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        rule = first_that_applies(_RULES, self)
+        object.__setattr__(self, "use", rule.outcome)
+        object.__setattr__(self, "why", rule.sentence(self))
 
     @classmethod
     def of(cls, match: Match, result: RegistrationResult) -> Answer:
@@ -64,13 +90,13 @@ class Answer:
 
     @property
     def is_accepted(self) -> bool:
-        """Accepted, and where a window was asked for, inside it."""
-        return self.verdict is Verdict.ACCEPTED and self.is_inside(self.match.prior)
+        """Whether it is believed by itself."""
+        return self.use is Use.EDGE
 
     @property
-    def is_guess(self) -> bool:
-        """Whether the transform means anything: accepted, or merely not sure enough."""
-        return self.verdict in _GUESSES and self.is_inside(self.match.prior)
+    def is_finite(self) -> bool:
+        """Whether probability and covariance are numbers."""
+        return math.isfinite(self.probability) and bool(np.isfinite(self.covariance).all())
 
     def is_about(self, prior: PriorWindow) -> bool:
         """Whether nearly this window was searched: the middle of each lies well in the other."""
@@ -97,6 +123,33 @@ class Answer:
             and abs(found.y - guess.y) <= 1.1 * prior.half_width_m
             and abs(wrap_angle(found.yaw - guess.yaw)) <= 1.1 * prior.half_width_rad
         )
+
+
+_RULES: tuple[Rule[Answer, Use], ...] = (
+    Rule(lambda a: a.T_target_source is None, Use.NOTHING, lambda a: a.reason),
+    Rule(
+        lambda a: not a.is_inside(a.match.prior),
+        Use.NOTHING,
+        lambda a: f"{a.reason}; but the pose is outside the window that was asked for",
+    ),
+    Rule(
+        lambda a: a.verdict not in (*_UNSURE, Verdict.ACCEPTED),
+        Use.NOTHING,
+        lambda a: a.reason,
+    ),
+    Rule(
+        lambda a: not a.is_finite,
+        Use.NOTHING,
+        lambda a: (
+            f"{a.reason}; but its probability {a.probability} and covariance "
+            f"{a.covariance.tolist()} are not finite"
+        ),
+    ),
+    Rule(lambda a: a.verdict is Verdict.ACCEPTED, Use.EDGE, lambda a: a.reason),
+    Rule(lambda a: a.probability >= _WORTH_ASKING, Use.CLAIM, lambda a: a.reason),
+    Rule(lambda _: True, Use.VOTE, lambda a: a.reason),
+)
+"""What the queue does with an answer. How votes are counted, `voting.weigh` says."""
 
 
 class AnswerBook:
@@ -133,7 +186,7 @@ class AnswerBook:
         if match.prior is None:
             return None
         for earlier in self._seen.get(self._maps_of(match), ()):
-            if earlier.is_guess and earlier.is_inside(match.prior):
+            if earlier.use >= Use.VOTE and earlier.is_inside(match.prior):
                 return earlier
             if self._is_lenient and earlier.is_about(match.prior):
                 return earlier

@@ -22,13 +22,13 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
-from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
+from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, Use
 from uw_dslam_ros2.core.merging.config import NUM_NEIGHBOURS, VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers, most_promising
 from uw_dslam_ros2.core.merging.settling import Component, Joint
-from uw_dslam_ros2.core.merging.verification import Verifier, is_worth_checking
+from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["make_growing_plan"]
@@ -103,7 +103,7 @@ class _GrowingPlanner:
     def _check_claims(self, pair: Pair) -> list[Joint]:
         """Joints of earlier answers that may be right, the one of the largest maps first."""
         for answer in self._claims.get(pair, ()):
-            if not is_worth_checking(answer):
+            if answer.use < Use.CLAIM:
                 continue
             sides = [
                 self._library.side_of(unit.ids)

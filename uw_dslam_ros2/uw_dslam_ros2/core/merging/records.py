@@ -100,7 +100,7 @@ def _merge_reason(submap_id: SubmapId, anchor: SubmapId | None, plan: Plan) -> s
 
 def _wait_reason(vehicle: str, answers: Sequence[Answer]) -> str:
     reasons = [
-        answer.reason
+        answer.why
         for answer in answers
         if not answer.is_accepted
         and vehicle in (answer.match.source.reference[0], answer.match.target.reference[0])

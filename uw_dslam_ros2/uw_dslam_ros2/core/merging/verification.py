@@ -8,7 +8,7 @@ from collections.abc import Container, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.merging.answers import Answer, AnswerBook, Match, MatchKey
+from uw_dslam_ros2.core.merging.answers import Answer, AnswerBook, Match, MatchKey, Use
 from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, MAX_CHECKS, NUM_NEIGHBOURS
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.graph import Edge, invert_covariance
@@ -27,12 +27,10 @@ from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
-__all__ = ["Verifier", "is_worth_checking"]
+__all__ = ["Verifier"]
 
 FloatArray = NDArray[np.float64]
 
-_WORTH_CHECKING = 0.5
-"""A match that was refused as not sure enough is still checked if it is this likely."""
 _NUM_ROUNDS = 3
 """Where the first checks leave it open, as many again are asked at other places."""
 _PRIOR_SIGMA = 3.0
@@ -71,7 +69,7 @@ class Verifier:
             All that the two maps belong to.
         """
         answer = self.ask(match)
-        if answer is None or not is_worth_checking(answer):
+        if answer is None or answer.use < Use.CLAIM:
             return []
         main = self._vote(answer)
         edge = main.joint.edge
@@ -204,7 +202,7 @@ class Verifier:
         return vote_of(self.joint(answer), answer)
 
     def _votes(self, replies: Sequence[Answer]) -> list[Vote]:
-        return [self._vote(reply) for reply in replies if reply.is_guess]
+        return [self._vote(reply) for reply in replies if reply.use >= Use.VOTE]
 
     def _weigh(
         self, votes: Sequence[Vote], num_checks: int, source: Side, target: Side
@@ -215,12 +213,6 @@ class Verifier:
         """All answers, or None while one is missing."""
         replies = [reply for match in matches if (reply := self.ask(match)) is not None]
         return replies if len(replies) == len(matches) else None
-
-
-def is_worth_checking(answer: Answer) -> bool:
-    """Whether an answer may be right: accepted, or not far from it."""
-    is_likely = answer.is_accepted or answer.probability >= _WORTH_CHECKING
-    return answer.is_guess and is_likely
 
 
 def _prior_around(guess: SE2, half_width_m: float, half_width_rad: float) -> PriorWindow:
