@@ -8,7 +8,7 @@ import pytest
 from uw_dslam_ros2.core.mapping import OccupancyConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.covariances import composed_covariance
 from uw_dslam_ros2.core.mapping.graph import SubmapGraph
-from uw_dslam_ros2.core.mapping.loops import _verified
+from uw_dslam_ros2.core.mapping.loop_verdict import decide_loop
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.rivals import without_direction
 from uw_dslam_ros2.core.mapping.section import OpenSection
@@ -59,7 +59,7 @@ def pair(segments, rng, along=1.0):
 
 
 def close(target, source, guess):
-    return _verified(target, source, Prior(guess, np.diag([0.3, 2.0, 0.03]) ** 2), CONFIG)
+    return decide_loop(target, source, Prior(guess, np.diag([0.3, 2.0, 0.03]) ** 2), CONFIG)
 
 
 @pytest.mark.parametrize("along", [1.0, 5.0])

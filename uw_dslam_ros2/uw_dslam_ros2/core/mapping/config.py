@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.navigation.config import NavigationConfig
+from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.sonar.config import SonarConfig
 
 __all__ = [
@@ -73,11 +74,29 @@ class MatchConfig(Config):
 
 
 @dataclass(frozen=True, slots=True)
+class LoopRegistrationConfig(GridRegistrationConfig):
+    """How the registration engine judges two submaps of one vehicle, near a guess.
+
+    The proof matters less here than the verdict: the window is small and many pairs are tried.
+    """
+
+    max_boxes: int = setting(20_000, 1000, 1_000_000_000, "boxes before the proof is given up")
+    max_seconds: float = setting(
+        20.0, 0.1, 3600.0, "not used: a map does not depend on how fast the machine is"
+    )
+    is_proof_required: bool = setting(
+        False, doc="refuse a match, however probable, that is not the proven optimum to the gap"
+    )
+    min_probability: float = setting(0.75, 0.0, 1.0, "least probability of an accepted match")
+
+
+@dataclass(frozen=True, slots=True)
 class LoopConfig(Config):
     """Loop closures between a vehicle's own submaps, and its pose graph."""
 
     is_enabled: bool = setting(True, doc="close loops inside the vehicle")
     max_candidates: int = setting(4, 0, 1000, "earlier submaps tried for each new one")
+    registration: LoopRegistrationConfig = setting(LoopRegistrationConfig())
 
 
 @dataclass(frozen=True, slots=True)

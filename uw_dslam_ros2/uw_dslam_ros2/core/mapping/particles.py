@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.covariances import rotated_covariance
-from uw_dslam_ros2.core.mapping.loops import (
+from uw_dslam_ros2.core.mapping.loop_verdict import (
     MAX_WINDOW_M,
     MAX_WINDOW_RAD,
     MIN_OVERLAP,
-    MIN_POINTS,
     SEARCH_SIGMA,
-    nearby,
     with_bend,
 )
+from uw_dslam_ros2.core.mapping.loops import MIN_POINTS, nearby
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.mapping.occupancy import SparseEvidence
 from uw_dslam_ros2.core.mapping.rivals import conflict
