@@ -5,7 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.registration.result import Progress, RegistrationResult, Verdict
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.registration.result import (
+    PriorWindow,
+    Progress,
+    RegistrationResult,
+    Verdict,
+)
 from uw_dslam_ros2.core.se2 import SE2
 
 
@@ -36,3 +42,10 @@ def test_a_stopped_search_keeps_what_it_had():
 def test_nothing_is_accepted_as_a_refusal():
     with pytest.raises(ValueError, match="ACCEPTED"):
         RegistrationResult.refused(Verdict.ACCEPTED, "because")
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("name", ["half_width_m", "half_width_rad"])
+def test_a_window_without_size_is_refused_by_name(name, bad):
+    with pytest.raises(InvalidInputError, match=f"{name} is {bad}"):
+        PriorWindow(SE2(), **{"half_width_m": 1.0, "half_width_rad": 0.1, name: bad})

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, Progress, Verdict
@@ -151,11 +152,32 @@ def test_the_papers_points_stay_selectable(harbour):
     assert 0.0 <= result.overlap <= 1.0
 
 
-def test_a_map_beyond_the_limit_is_refused_by_name(harbour):
-    config = GridRegistrationConfig(max_side_cells=150)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("min_probability", 0.9),
+        ("max_conflict", 0.2),
+        ("min_overlap", 0.3),
+        ("is_proof_required", True),
+        ("max_rival_probability", 0.5),
+        ("max_slide_share", 0.5),
+        ("free_penalty", 0.1),
+    ],
+)
+def test_the_papers_points_refuse_what_they_do_not_know(name, value):
+    with pytest.raises(ConfigError, match=f"{name} is {value}, expected .*method paper"):
+        GridRegistrationConfig(method="paper", **{name: value})
+    assert getattr(GridRegistrationConfig(**{name: value}), name) == value
+    GridRegistrationConfig(method="paper", features="walls", gap=0.2, max_boxes=5000)
+
+
+@pytest.mark.parametrize("method", ["signed", "paper"])
+def test_a_map_beyond_the_limit_is_refused_by_name(harbour, method):
+    config = GridRegistrationConfig(method=method, max_side_cells=150)
     result = register_grids(harbour.source, harbour.target, config)
-    assert not result.is_accepted
-    assert "180 x 180" in result.reason
+    assert result.verdict is Verdict.BUDGET_EXHAUSTED
+    assert "180 x 180 cells, expected at most 150" in result.reason
+    assert result.T_target_source is None
 
 
 def test_different_places_are_refused():

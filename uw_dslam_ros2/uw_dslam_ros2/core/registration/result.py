@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["PriorWindow", "Progress", "RegistrationResult", "Rival", "Verdict"]
@@ -38,6 +39,12 @@ class PriorWindow:
     T_target_source: SE2
     half_width_m: float
     half_width_rad: float
+
+    def __post_init__(self) -> None:
+        for name in ("half_width_m", "half_width_rad"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InvalidInputError(f"the prior's {name} is {value}, expected more than 0")
 
 
 @dataclass(frozen=True, slots=True)

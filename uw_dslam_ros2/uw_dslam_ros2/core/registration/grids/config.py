@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.errors import ConfigError
 
 __all__ = ["GridRegistrationConfig"]
 
 
+# What method paper knows; the rest is of walls and free space, and of the verdict on them.
+_OF_PAPER = (
+    "method", "features", "max_points", "max_side_cells", "gap", "max_boxes", "max_seconds",
+)  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class GridRegistrationConfig(Config):
-    """How two occupancy maps are matched; "cells" are those of the finest level."""
+    """How two occupancy maps are matched; "cells" are those of the finest level.
+
+    Method paper judges points by the posterior of `RegistrationConfig`, always with a proof. So it
+    refuses any other value than the default for what only the other method knows.
+    """
 
     method: str = setting(
         "signed",
@@ -47,3 +59,15 @@ class GridRegistrationConfig(Config):
     min_probability: float = setting(
         0.75, 0.0, 1.0, "least probability of an accepted match", is_basic=True
     )
+
+    def __post_init__(self) -> None:
+        Config.__post_init__(self)
+        if self.method != "paper":
+            return
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name not in _OF_PAPER and value != field.default:
+                raise ConfigError(
+                    f"{type(self).__name__}.{field.name} is {value}, expected {field.default}, "
+                    "the default: method paper does not know this setting"
+                )

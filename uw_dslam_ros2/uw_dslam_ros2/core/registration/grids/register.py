@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grids.agreement import WallMap
@@ -83,14 +82,18 @@ def register_grids(
     RegistrationResult
         ``T_target_source`` takes metres in the source grid's frame to metres in the target grid's
         frame.
-
-    Raises
-    ------
-    InvalidInputError
-        Where a prior's widths are not positive.
     """
     config = config or GridRegistrationConfig()
     source, target = shrink_blocks(source), shrink_blocks(target)
+    for name, occupancy in (("source", source), ("target", target)):
+        rows, cols = occupancy.spec.shape
+        if max(rows, cols) > config.max_side_cells:
+            return RegistrationResult.refused(
+                Verdict.BUDGET_EXHAUSTED,
+                f"the {name} map has {rows} x {cols} cells, expected at most "
+                f"{config.max_side_cells} on a side",
+                seconds=0.0 if clock is not None else math.nan,
+            )
     if config.method == "paper":
         return register_grids_by_points(
             source, target, config,
@@ -128,11 +131,6 @@ class _GridMatch:
         prior: PriorWindow | None,
         clock: Clock | None,
     ) -> None:
-        if prior is not None and not (prior.half_width_m > 0.0 and prior.half_width_rad > 0.0):
-            raise InvalidInputError(
-                f"the prior's half-widths are {prior.half_width_m} m and "
-                f"{prior.half_width_rad} rad, expected positive numbers"
-            )
         self._source, self._target = source, target
         self._frames = GridFrames(source.spec, target.spec)
         self._config, self._prior, self._clock = config, prior, clock
@@ -145,14 +143,6 @@ class _GridMatch:
         is_cancelled: Callable[[], bool] | None,
     ) -> RegistrationResult:
         """The recipe."""
-        for name, occupancy in (("source", self._source), ("target", self._target)):
-            if max(occupancy.spec.shape) > self._config.max_side_cells:
-                rows, cols = occupancy.spec.shape
-                return self._refused(
-                    Verdict.BUDGET_EXHAUSTED,
-                    f"the {name} map has {rows} x {cols} cells, more than the limit of "
-                    f"{self._config.max_side_cells} on a side",
-                )
         prepared = prepare_maps(self._source, self._target, self._config)
         if isinstance(prepared, str):
             return self._refused(Verdict.TOO_FEW_FEATURES, prepared)
