@@ -47,10 +47,18 @@ def parameter_tables(*, is_basic: bool) -> str:
         items = list(settings_of(own))
         for prefix, config_type in GROUPS[node]:
             items += settings_of(config_type, prefix)
+        items = [item for item in items if not _is_repeated(*item)]
         rows = [_row(*item) for item in items if _is_basic(item[2]) == is_basic]
         header = "| parameter | type | default | range | meaning |\n|---|---|---|---|---|"
         parts.append(f"### {node}\n\n{header}\n" + "\n".join(rows))
     return "\n\n".join(parts)
+
+
+def _is_repeated(name: str, _: type[Config], field: dataclasses.Field[Any]) -> bool:
+    """Whether a parameter of loops is as the server's of that name, which has its row already."""
+    if not name.startswith("mapper.loop.registration."):
+        return False
+    return bool(field.default == GridRegistrationConfig.__dataclass_fields__[field.name].default)
 
 
 def _is_basic(field: dataclasses.Field[Any]) -> bool:
