@@ -14,7 +14,7 @@ class RegistrationConfig(Config):
     """How two point sets are matched.
 
     ``method`` "likelihood" searches the logarithm of a likelihood ratio (each point has a partner
-    or is clutter) with a ladder of kernels, and estimates noise and clutter share; "gmrbnb" is the
+    or is clutter) with several kernels, and estimates noise and clutter share; "gmrbnb" is the
     paper's: plain sum of Gaussians, inliers by nearest-neighbour density, second search. The
     defaults of ``nnde_neighbors`` and ``nnde_threshold`` are from ``study nnde --sweep``; what
     they are worth on other seeds stands in docs/experiments.md.

@@ -25,7 +25,7 @@ from uw_dslam_ros2.core.registration.result import RegistrationResult, Rival, Ve
 from uw_dslam_ros2.core.registration.search.branch_and_bound import SearchOutcome, Status, Term
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["Candidate", "Rung", "packed", "too_few"]
+__all__ = ["Candidate", "KernelSearch", "result_of", "too_few"]
 
 FloatArray = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ Candidate = tuple[float, Refinement]  # evidence, and what it is for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rung:
+class KernelSearch:
     """One search, and the refined poses it led to, best evidence first."""
 
     sigma_m: float
@@ -46,9 +46,9 @@ class Rung:
     candidates: list[Candidate]
 
 
-def packed(
+def result_of(
     pair: Pair,
-    rung: Rung,
+    found: KernelSearch,
     candidates: Sequence[Candidate],
     config: RegistrationConfig,
     *,
@@ -56,11 +56,11 @@ def packed(
     num_boxes: int,
     seconds: float,
 ) -> RegistrationResult:
-    """Verdict, pose and certificate; the bounds are those of `rung`, the pose is the first one."""
-    outcome, best = rung.outcome, candidates[0][1]
-    values = _values(rung, [r.pose() for _, r in candidates[: 1 + config.max_rivals]])
-    lower = (outcome.lower_bound - rung.error) / rung.unit
-    upper = (outcome.upper_bound + rung.error) / rung.unit
+    """Verdict, pose and certificate; the bounds are of `found`, the pose is the first one."""
+    outcome, best = found.outcome, candidates[0][1]
+    values = _values(found, [r.pose() for _, r in candidates[: 1 + config.max_rivals]])
+    lower = (outcome.lower_bound - found.error) / found.unit
+    upper = (outcome.upper_bound + found.error) / found.unit
     gap = max(0.0, 1.0 - lower / upper) if upper > 0.0 else 0.0
     covariance = evidence.repetition * best.covariance()
     verdict, reason, probability = decide_points(
@@ -85,7 +85,7 @@ def packed(
         T_target_source=pose,
         covariance=pair.full_covariance(covariance, best.pose()),
         probability=probability,
-        score=min(values[0] / rung.unit, upper),
+        score=min(values[0] / found.unit, upper),
         lower_bound=lower,
         upper_bound=upper,
         is_certified=outcome.status is Status.CERTIFIED,
@@ -96,7 +96,7 @@ def packed(
         inlier_ratio=float(is_inlier.mean()),
         num_source_points=len(source_points),
         num_target_points=len(target_points),
-        rivals=_rivals(pair, rung, candidates, values),
+        rivals=_rivals(pair, found, candidates, values),
         source_points=source_points,
         target_points=target_points,
         is_inlier=is_inlier,
@@ -141,14 +141,14 @@ def _is_line(points: FloatArray) -> bool:
     return bool(across * len(points) ** 2 < along)
 
 
-def _values(rung: Rung, poses: Sequence[SE2]) -> list[float]:
+def _values(found: KernelSearch, poses: Sequence[SE2]) -> list[float]:
     """What the search's objective says of poses."""
-    problem = rung.outcome.neighborhoods.problem
+    problem = found.outcome.neighborhoods.problem
     return [problem.value_at(problem.from_pose(pose))[0] for pose in poses]
 
 
 def _rivals(
-    pair: Pair, rung: Rung, candidates: Sequence[Candidate], values: Sequence[float]
+    pair: Pair, found: KernelSearch, candidates: Sequence[Candidate], values: Sequence[float]
 ) -> tuple[Rival, ...]:
     """The other poses, scored as shares of the best one's objective, bounded around each."""
     best = max(values[0], 1e-300)
@@ -157,7 +157,7 @@ def _rivals(
         Rival(
             pair.full_pose(pose),
             max(value, 0.0) / best,
-            max(rung.outcome.upper_bound_near(pose), value) / best,
+            max(found.outcome.upper_bound_near(pose), value) / best,
         )
         for pose, value in zip(others, values[1:], strict=True)
     )

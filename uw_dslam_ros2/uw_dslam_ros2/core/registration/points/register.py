@@ -23,7 +23,12 @@ from uw_dslam_ros2.core.registration.points.design_effect import design_effect
 from uw_dslam_ros2.core.registration.points.evidence import EvidenceModel, Outline
 from uw_dslam_ros2.core.registration.points.input import Cloud, Pair, cloud_of
 from uw_dslam_ros2.core.registration.points.nnde import nnde_inliers
-from uw_dslam_ros2.core.registration.points.output import Candidate, Rung, packed, too_few
+from uw_dslam_ros2.core.registration.points.output import (
+    Candidate,
+    KernelSearch,
+    result_of,
+    too_few,
+)
 from uw_dslam_ros2.core.registration.points.refine import PointModel, evaluate_pose, polish, refine
 from uw_dslam_ros2.core.registration.points.refinement import Refinement
 from uw_dslam_ros2.core.registration.points.verdict import posterior
@@ -163,15 +168,15 @@ class _Match:
     def result(self, start: float) -> RegistrationResult:
         """Search, refine, decide."""
         if self._config.method == "likelihood":
-            rungs, candidates = self._likelihood()
+            searches, candidates = self._likelihood()
         else:
-            rungs, candidates = self._gmrbnb()
+            searches, candidates = self._gmrbnb()
         candidates = self._best_first(candidates)
         candidates[0] = self._polished(candidates[0])
-        return packed(
-            self._pair, rungs[0], candidates, self._config,
+        return result_of(
+            self._pair, searches[0], candidates, self._config,
             evidence=self._evidence,
-            num_boxes=sum(rung.outcome.num_boxes for rung in rungs),
+            num_boxes=sum(found.outcome.num_boxes for found in searches),
             seconds=self._clock() - start if self._clock else math.nan,
         )  # fmt: skip
 
@@ -188,21 +193,21 @@ class _Match:
         best = max(candidates, key=lambda pair: self._evidence.of(pair[1], repetition))
         return [best, *(pair for pair in candidates if pair is not best)]
 
-    def _likelihood(self) -> tuple[list[Rung], list[Candidate]]:
+    def _likelihood(self) -> tuple[list[KernelSearch], list[Candidate]]:
         """Searches and all candidates, until these are decisive."""
-        rungs = [self._rung(self._first_sigma_m(), self._config.max_boxes)]
-        candidates = self._reweighed(rungs[0].candidates)
-        if self._is_over(rungs[-1], candidates) or self._has_own_sigma():
-            return rungs, candidates
+        searches = [self._searched(self._first_sigma_m(), self._config.max_boxes)]
+        candidates = self._reweighed(searches[0].candidates)
+        if self._is_over(searches[-1], candidates) or self._has_own_sigma():
+            return searches, candidates
         if self._prior is None:
             candidates = self._reweighed([*candidates, *self._from_lattices()])
-            if self._is_over(rungs[-1], candidates):
-                return rungs, candidates
-        rungs.append(self._rung(_LAST * self._spacing_m, _LAST_BOXES))
-        return rungs, self._reweighed([*candidates, *rungs[-1].candidates])
+            if self._is_over(searches[-1], candidates):
+                return searches, candidates
+        searches.append(self._searched(_LAST * self._spacing_m, _LAST_BOXES))
+        return searches, self._reweighed([*candidates, *searches[-1].candidates])
 
-    def _is_over(self, rung: Rung, candidates: list[Candidate]) -> bool:
-        is_stopped = rung.outcome.status in (Status.TIME, Status.CANCELLED)
+    def _is_over(self, found: KernelSearch, candidates: list[Candidate]) -> bool:
+        is_stopped = found.outcome.status in (Status.TIME, Status.CANCELLED)
         return is_stopped or self._is_decisive(candidates)
 
     def _has_own_sigma(self) -> bool:
@@ -244,7 +249,7 @@ class _Match:
             config.gap, max_boxes, left, config.max_memory_mb, _RIVAL_FACTOR, _RIVAL_BOXES
         )
 
-    def _rung(self, sigma_m: float | None, max_boxes: int) -> Rung:
+    def _searched(self, sigma_m: float | None, max_boxes: int) -> KernelSearch:
         """Search with one kernel (None: each point its own) and refine what was met."""
         terms = []
         for points, weights, sigmas_m in self._classes(sigma_m, self._source, self._target):
@@ -258,7 +263,7 @@ class _Match:
         unit = sum(float(term.weights.sum()) for term in terms)
         outcome = self._search(terms, "search", max_boxes)
         start = sigma_m if sigma_m is not None else width
-        return Rung(start, terms, outcome, unit, 0.0, self._refined(outcome, start))
+        return KernelSearch(start, terms, outcome, unit, 0.0, self._refined(outcome, start))
 
     def _contrast(self, sigma_m: float) -> float:
         """Density of a source point on top of a target over that of clutter."""
@@ -362,27 +367,27 @@ class _Match:
         evidence = self._evidence.of(refinement)
         return (evidence, refinement) if evidence >= candidate[0] - 1.0 else candidate
 
-    def _gmrbnb(self) -> tuple[list[Rung], list[Candidate]]:
+    def _gmrbnb(self) -> tuple[list[KernelSearch], list[Candidate]]:
         """The paper's two passes."""
         own = self._config.sigma or 0.5 * self._spacing_m / math.sqrt(2.0)
         first = self._first_sigma_m()
         sigma_m = None if first is None else math.sqrt(2.0) * own
-        rung = self._mixture_rung(sigma_m, self._source, self._target, "search")
-        moved = rung.outcome.T_target_source.apply(self._source.points)
+        found = self._mixture_search(sigma_m, self._source, self._target, "search")
+        moved = found.outcome.T_target_source.apply(self._source.points)
         config = self._config
         is_near = [
             nnde_inliers(a, b, config.nnde_neighbors, config.nnde_threshold, own)
             for a, b in ((moved, self._target.points), (self._target.points, moved))
         ]
         if min(int(mask.sum()) for mask in is_near) < self._config.min_points:
-            return [rung], self._reweighed(rung.candidates)
+            return [found], self._reweighed(found.candidates)
         source, target = self._source.subset(is_near[0]), self._target.subset(is_near[1])
-        again = self._mixture_rung(sigma_m, source, target, "inliers")
-        return [rung, again], self._reweighed([*rung.candidates, *again.candidates])
+        again = self._mixture_search(sigma_m, source, target, "inliers")
+        return [found, again], self._reweighed([*found.candidates, *again.candidates])
 
-    def _mixture_rung(
+    def _mixture_search(
         self, sigma_m: float | None, source: Cloud, target: Cloud, stage: str
-    ) -> Rung:
+    ) -> KernelSearch:
         terms, error = [], 0.0
         for points, weights, sigmas_m in self._classes(sigma_m, source, target):
             field = mixture_field(
@@ -393,4 +398,4 @@ class _Match:
         unit = sum(float(term.weights.sum()) for term in terms) * float(target.weights.max())
         outcome = self._search(terms, stage, self._config.max_boxes)
         width = sigma_m if sigma_m is not None else float(np.sqrt(np.mean(sigmas_m**2)))
-        return Rung(width, terms, outcome, unit, error, self._refined(outcome, width))
+        return KernelSearch(width, terms, outcome, unit, error, self._refined(outcome, width))

@@ -17,7 +17,7 @@ __all__ = ["PointCase", "PoseHypothesis", "decide_points", "posterior"]
 
 # Weight of chance against a pose that was found. A Bayes factor of 1 is rare among unrelated sets:
 # the best of all their poses exceeds evidence x in a share of about 2e-4 exp(-x) of all cases.
-_CHANCE = 0.005
+_COINCIDENCE = 0.005
 _FIT = 0.5  # share of the points with a partner from which two sets are said to fit
 _OPEN = 0.5  # standard deviation, in spacings, from which a pose is not determined
 _DOUBTED = 0.5  # most probability left to a pose that the points do not tell from others
@@ -38,7 +38,7 @@ def posterior(evidences: Sequence[float]) -> float:
     """Probability of the first hypothesis against all others and against chance (evidence 0)."""
     top = max(0.0, *evidences)
     terms = [math.exp(evidence - top) for evidence in evidences]
-    return terms[0] / (_CHANCE * math.exp(-top) + sum(terms))
+    return terms[0] / (_COINCIDENCE * math.exp(-top) + sum(terms))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +75,14 @@ class PointCase:
         return posterior(self.evidences)
 
     @property
-    def is_chance(self) -> bool:
+    def is_coincidence(self) -> bool:
         """Whether the best pose is no better than chance."""
         return posterior([self.best.evidence]) < self.min_posterior
 
     @property
     def least_evidence(self) -> float:
         """Evidence from which a pose is better than chance [nats]."""
-        return math.log(_CHANCE * self.min_posterior / (1.0 - self.min_posterior))
+        return math.log(_COINCIDENCE * self.min_posterior / (1.0 - self.min_posterior))
 
     @cached_property
     def deviation_m(self) -> float:
@@ -138,7 +138,7 @@ _RULES: tuple[Rule[PointCase, Verdict], ...] = (
         lambda c: f"the points tell too little to judge their best alignment by: {c.not_finite}",
     ),
     Rule(
-        lambda c: c.is_chance and c.is_line,
+        lambda c: c.is_coincidence and c.is_line,
         Verdict.AMBIGUOUS,
         lambda c: (
             "both sets lie on a line, and nothing tells where along it they fit: " + c.too_little
@@ -146,7 +146,7 @@ _RULES: tuple[Rule[PointCase, Verdict], ...] = (
         most_probability=_DOUBTED,
     ),
     Rule(
-        lambda c: c.is_chance and c.fits_in_many_ways,
+        lambda c: c.is_coincidence and c.fits_in_many_ways,
         Verdict.AMBIGUOUS,
         lambda c: (
             f"{100.0 * c.best.pair_share:.0f} % of the points find partners, but they repeat "
@@ -155,7 +155,7 @@ _RULES: tuple[Rule[PointCase, Verdict], ...] = (
         most_probability=_DOUBTED,
     ),
     Rule(
-        lambda c: c.is_chance,
+        lambda c: c.is_coincidence,
         Verdict.IMPROBABLE,
         lambda c: f"the best alignment is no better than chance: {c.too_little}",
     ),
