@@ -80,20 +80,22 @@ def test_g2o_is_read_from_literal_text(tmp_path):
     np.testing.assert_allclose(edge.covariance, np.diag([0.25, 0.5, 0.01]), atol=1e-12)
 
 
-def test_gtsam_reads_our_g2o_as_we_do(tmp_path):
-    gtsam = pytest.importorskip("gtsam")
-    vertices = {0: SE2(), 1: SE2(1.0, 2.0, 0.7)}
-    covariance = np.array([[0.2, 0.05, 0.01], [0.05, 0.3, 0.0], [0.01, 0.0, 0.02]])
-    path = write_g2o(
-        tmp_path / "a.g2o", vertices, [PoseGraphEdge(0, 1, SE2(1.1, 2.1, 0.8), covariance)]
+def test_the_information_in_a_g2o_file_weighs_errors_as_our_covariance_does(tmp_path):
+    measured, covariance = (
+        SE2(1.1, 2.1, 0.8),
+        np.array([[0.2, 0.05, 0.01], [0.05, 0.3, 0.0], [0.01, 0.0, 0.02]]),
     )
-    graph, values = gtsam.readG2o(str(path), False)
-    np.testing.assert_allclose(values.atPose2(1).translation(), [1.0, 2.0])
-    # The Mahalanobis distance of a small displacement is the one that our covariance means.
+    path = tmp_path / "a.g2o"
+    write_g2o(path, {0: SE2(), 1: measured}, [PoseGraphEdge(0, 1, measured, covariance)])
+    numbers = [float(word) for word in path.read_text().splitlines()[2].split()[6:]]
+    information = np.zeros((3, 3))
+    information[np.triu_indices(3)] = numbers
+    information += np.triu(information, 1).T
     moved = np.array([1e-4, -2e-4, 3e-4])
-    values.update(1, gtsam.Pose2(1.1 + moved[0], 2.1 + moved[1], 0.8 + moved[2]))
-    expected = 0.5 * moved @ np.linalg.inv(covariance) @ moved
-    assert graph.at(0).error(values) == pytest.approx(expected, rel=2e-3)
+    # g2o's error of an EDGE_SE2: what is left of the poses' motion after the measured one.
+    error = (measured.inverse() @ SE2.from_array(measured.as_array() + moved)).as_array()
+    expected = moved @ np.linalg.inv(covariance) @ moved
+    assert error @ information @ error == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.mapping import OccupancyConfig, VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.covariances import composed_covariance
 from uw_dslam_ros2.core.mapping.graph import SubmapGraph
 from uw_dslam_ros2.core.mapping.loop_verdict import decide_loop
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.rivals import without_direction
 from uw_dslam_ros2.core.mapping.section import OpenSection
+from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import SonarConfig, detections_from_scan
 from uw_dslam_ros2.sim.world import cast_rays
@@ -119,7 +119,7 @@ def test_covariance_without_loops_is_that_of_the_steps():
     graph, step, covariance = graph_of()
     pose, expected = SE2(), np.zeros((3, 3))
     for _ in range(6):
-        pose, expected = pose @ step, composed_covariance(pose, expected, step, covariance)
+        pose, expected = pose @ step, chained_covariance(pose, expected, step, covariance)
     np.testing.assert_allclose(graph.covariance(), expected, rtol=0.02, atol=1e-3)
 
 

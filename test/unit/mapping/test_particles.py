@@ -8,8 +8,8 @@ import pytest
 
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.config import ParticleConfig
-from uw_dslam_ros2.core.mapping.covariances import composed_covariance
 from uw_dslam_ros2.core.mapping.particles import ParticleFilter, _proposal
+from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2
 
 CONFIG = VehicleMapperConfig(estimator="particle_filter")
@@ -44,7 +44,7 @@ def test_without_echoes_it_is_odometry():
         assert distance < 0.03  # the mean of turned steps is a little shorter than one of them
         assert turn < 0.003
         last_covariance = covariance
-        pose, covariance = pose @ STEP, composed_covariance(pose, covariance, STEP, COVARIANCE)
+        pose, covariance = pose @ STEP, chained_covariance(pose, covariance, STEP, COVARIANCE)
     # 400 draws know a standard deviation to 3.5 %; linearised, the truth is a little off as well.
     expected = np.sqrt(np.diag(last_covariance))
     np.testing.assert_allclose(np.sqrt(np.diag(found.covariance())), expected, rtol=0.15)
@@ -54,7 +54,7 @@ def test_an_undrawn_step_counts_in_the_covariance():
     found = walked(2)
     before = found.covariance()
     found.add_next(STEP, COVARIANCE)
-    expected = composed_covariance(found.poses[-2], before, STEP, COVARIANCE)
+    expected = chained_covariance(found.poses[-2], before, STEP, COVARIANCE)
     np.testing.assert_allclose(found.covariance(), expected, rtol=0.05, atol=1e-4)
 
 

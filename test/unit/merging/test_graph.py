@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.merging.consistency import Side, consistent_set, cycle_distance
-from uw_dslam_ros2.core.merging.graph import (
-    Edge,
+from uw_dslam_ros2.core.merging.library import milestone
+from uw_dslam_ros2.core.merging.types import Edge
+from uw_dslam_ros2.core.pose_graph import (
     compose_covariance,
     invert_covariance,
     residual,
     solve_graph,
 )
-from uw_dslam_ros2.core.merging.library import milestone
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 
@@ -93,9 +93,9 @@ def test_false_edges_are_found_and_do_no_harm():
         initial[step.source] = initial[step.target] @ step.T_target_source
     solution = solve_graph(("a", 0), firm, [*right, *wrong], initial, 0.999)
     assert solution.is_inlier.tolist() == [True] * 4 + [False] * 2
-    worst = max(T.distance_to(truth[i])[0] for i, T in solution.T_anchor_submap.items())
+    worst = max(T.distance_to(truth[i])[0] for i, T in solution.T_anchor_pose.items())
     assert worst < 0.5
-    assert residual(wrong[0], solution.T_anchor_submap)[0] > 5.0
+    assert residual(wrong[0], solution.T_anchor_pose)[0] > 5.0
 
 
 def test_the_largest_consistent_set_is_that_of_trying_all():

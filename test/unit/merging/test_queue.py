@@ -11,8 +11,8 @@ from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, SubmapState
-from uw_dslam_ros2.core.merging.graph import Edge
 from uw_dslam_ros2.core.merging.settling import Joint, loop_errors
+from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, lawnmower_fleet, refuse

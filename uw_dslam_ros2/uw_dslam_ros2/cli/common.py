@@ -30,7 +30,7 @@ __all__ = [
 EXIT_BAD_INPUT = 2
 """Exit code for wrong usage, files and settings; argparse uses the same."""
 _EXIT_INTERRUPTED = 130
-_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "scikit-learn", "gtsam")
+_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "scikit-learn")
 
 
 def parser_for(name: str, description: str, example: str) -> argparse.ArgumentParser:

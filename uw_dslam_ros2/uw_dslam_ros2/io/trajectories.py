@@ -96,7 +96,7 @@ def read_tum(path: str | Path) -> tuple[IntArray, FloatArray]:
 
 
 def g2o_bytes(vertices: Mapping[int, SE2], edges: Sequence[PoseGraphEdge]) -> bytes:
-    """A planar pose graph; information in the source's axes, as g2o and gtsam take it."""
+    """A planar pose graph; information in the source's axes, as g2o takes it."""
     lines = [f"VERTEX_SE2 {key} {p.x:.9g} {p.y:.9g} {p.yaw:.12g}\n" for key, p in vertices.items()]
     for edge in edges:
         for key in (edge.target, edge.source):

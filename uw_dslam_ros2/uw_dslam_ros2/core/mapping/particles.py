@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.covariances import rotated_covariance
 from uw_dslam_ros2.core.mapping.loop_verdict import (
     MAX_WINDOW_M,
     MAX_WINDOW_RAD,
@@ -21,6 +20,7 @@ from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_poi
 from uw_dslam_ros2.core.mapping.occupancy import SparseEvidence
 from uw_dslam_ros2.core.mapping.rivals import conflict
 from uw_dslam_ros2.core.mapping.section import ClosedSection
+from uw_dslam_ros2.core.pose_graph import compose_covariance
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["ParticleFilter"]
@@ -85,7 +85,7 @@ class ParticleFilter:
         if self._step is None:
             return np.asarray(spread)
         # The step to the newest submap has not been drawn yet.
-        return np.asarray(spread + rotated_covariance(self._step[1], self.poses[-2].yaw))
+        return spread + compose_covariance(self._step[1], self.poses[-2], self._step[0], SE2())
 
     def add_first(self, T_odom_submap: SE2, covariance: FloatArray) -> None:  # noqa: ARG002
         """Begin with the first submap, where the odom frame begins."""
@@ -193,7 +193,9 @@ class ParticleFilter:
             against = max(against, there, back)
         if against > _MAX_CONFLICT:
             return None
-        information = with_bend(match.information, rotated_covariance(newest.drift, step.yaw))
+        information = with_bend(
+            match.information, compose_covariance(newest.drift, step, SE2(), SE2())
+        )
         fit = match.score - against
         num_independent = config.match.information_share * len(source[::stride])
         return _proposal(

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.covariances import composed_covariance
 from uw_dslam_ros2.core.mapping.estimators import make_estimator
 from uw_dslam_ros2.core.mapping.fused_map import FusedMap
 from uw_dslam_ros2.core.mapping.local_map import LocalMap
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.navigation import NavigationFilter
+from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
     Detections,
@@ -186,7 +186,7 @@ class VehicleMapper:
         T_submap_base, own = SE2(), np.zeros((3, 3))
         if self._open is not None:
             T_submap_base, own = self._navigation.relative_at(stamp_ns)
-        return composed_covariance(T_odom_submap, self._estimator.covariance(), T_submap_base, own)
+        return chained_covariance(T_odom_submap, self._estimator.covariance(), T_submap_base, own)
 
     @property
     def velocity(self) -> tuple[FloatArray, float]:

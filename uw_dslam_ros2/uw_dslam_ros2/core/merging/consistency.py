@@ -13,8 +13,8 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.merging.graph import (
-    Edge,
+from uw_dslam_ros2.core.merging.types import Edge
+from uw_dslam_ros2.core.pose_graph import (
     chi2_threshold,
     compose_covariance,
     invert_covariance,

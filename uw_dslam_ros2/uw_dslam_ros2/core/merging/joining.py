@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.merging.answers import Answer
-from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.settling import Joint
+from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.units import Unit
+from uw_dslam_ros2.core.pose_graph import compose_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 

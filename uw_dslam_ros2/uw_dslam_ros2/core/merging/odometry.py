@@ -8,8 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance, invert_covariance
+from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.units import StoredSubmap
+from uw_dslam_ros2.core.pose_graph import chained_covariance, invert_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
@@ -67,8 +68,8 @@ class Odometry:
         covariance, motion = np.zeros((3, 3)), SE2()
         for submap_id in reversed(chain[:-1]):
             step = self._step[submap_id]
-            covariance = compose_covariance(covariance, SE2(), motion, step.T_target_source) + (
-                compose_covariance(step.covariance, motion, step.T_target_source, SE2())
+            covariance = chained_covariance(
+                motion, covariance, step.T_target_source, step.covariance
             )
             motion = motion @ step.T_target_source
             self._covariances[target, submap_id] = covariance

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.merging.consistency import Side
-from uw_dslam_ros2.core.merging.graph import Edge, compose_covariance
 from uw_dslam_ros2.core.merging.library import Library
+from uw_dslam_ros2.core.merging.types import Edge
+from uw_dslam_ros2.core.pose_graph import compose_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 

@@ -29,9 +29,9 @@ from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.descriptors import promise
-from uw_dslam_ros2.core.merging.graph import Edge
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.settling import Component, Joint
+from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.submap import SubmapId

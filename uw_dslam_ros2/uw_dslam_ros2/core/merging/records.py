@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
 from uw_dslam_ros2.core.merging.answers import Answer
-from uw_dslam_ros2.core.merging.graph import residual
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
@@ -15,6 +14,7 @@ from uw_dslam_ros2.core.merging.types import (
     SubmapState,
 )
 from uw_dslam_ros2.core.merging.units import StoredSubmap
+from uw_dslam_ros2.core.pose_graph import residual
 from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["constraints_of", "records_of"]

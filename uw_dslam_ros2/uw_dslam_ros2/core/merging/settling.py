@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import networkx as nx
 
 from uw_dslam_ros2.core.merging.answers import MatchKey
-from uw_dslam_ros2.core.merging.graph import Edge, solve_graph
+from uw_dslam_ros2.core.merging.types import Edge
+from uw_dslam_ros2.core.pose_graph import solve_graph
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
@@ -72,7 +73,7 @@ def settle(
                 if not agrees:
                     is_inlier[joint.key] = False
                     num_dropped += 1
-            components.append(solution.T_anchor_submap)
+            components.append(solution.T_anchor_pose)
         if num_dropped == 0:
             settled = [replace(joint, is_inlier=is_inlier[joint.key]) for joint in ordered]
             return settled, components

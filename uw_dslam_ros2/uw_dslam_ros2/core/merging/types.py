@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core import pose_graph
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
@@ -16,6 +17,7 @@ from uw_dslam_ros2.core.submap import Submap, SubmapId
 __all__ = [
     "Constraint",
     "ConstraintKind",
+    "Edge",
     "MapProvenance",
     "MatchRequest",
     "SubmapRecord",
@@ -23,6 +25,9 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
+
+Edge = pose_graph.Edge[SubmapId]
+"""Edge of the pose graph between two submaps."""
 
 
 class SubmapState(enum.IntEnum):

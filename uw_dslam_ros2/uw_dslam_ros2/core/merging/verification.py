@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.merging.answers import Answer, AnswerBook, Match, MatchKey, Use
 from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, MAX_CHECKS, NUM_NEIGHBOURS
 from uw_dslam_ros2.core.merging.consistency import Side
-from uw_dslam_ros2.core.merging.graph import Edge, invert_covariance
 from uw_dslam_ros2.core.merging.joining import joint_of
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.places import (
@@ -22,7 +21,9 @@ from uw_dslam_ros2.core.merging.places import (
     vague_places,
 )
 from uw_dslam_ros2.core.merging.settling import Joint
+from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.voting import ENOUGH_ODDS, Vote, vote_of, weigh
+from uw_dslam_ros2.core.pose_graph import invert_covariance
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId

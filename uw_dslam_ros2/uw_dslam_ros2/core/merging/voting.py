@@ -10,8 +10,9 @@ import numpy as np
 
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.merging.consistency import Side, consistent_set, cycle_of
-from uw_dslam_ros2.core.merging.graph import Edge, chi2_threshold
 from uw_dslam_ros2.core.merging.settling import Joint
+from uw_dslam_ros2.core.merging.types import Edge
+from uw_dslam_ros2.core.pose_graph import chi2_threshold
 from uw_dslam_ros2.core.registration.result import PriorWindow
 
 __all__ = ["ENOUGH_ODDS", "Vote", "vote_of", "weigh"]
