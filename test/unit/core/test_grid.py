@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 
 
@@ -56,14 +56,3 @@ def test_an_occupancy_map_cannot_be_written_to():
     occupancy = OccupancyMap(GridSpec(1.0, 1, 2), np.array([[0, 100]], dtype=np.int8))
     with pytest.raises(ValueError, match="read-only"):
         occupancy.values[0, 0] = 3
-
-
-def test_evidence_survives_the_round_trip_over_occupancy():
-    log_odds = np.array([[-2.0, 0.0, 3.0], [0.0, 0.0, 0.0]], dtype=np.float32)
-    observed = np.array([[True, True, True], [False, False, True]])
-    grid = EvidenceGrid(GridSpec(0.05, 2, 3), log_odds, observed)
-    occupancy = grid.to_occupancy()
-    assert occupancy.values.tolist() == [[12, 50, 95], [-1, -1, 50]]
-    back = EvidenceGrid.from_occupancy(occupancy)
-    assert (back.observed == observed).all()
-    assert (back.to_occupancy().values == occupancy.values).all()

@@ -27,9 +27,9 @@ def test_every_cell_names_the_submaps_that_saw_it():
     found = queue.provenance()
     fused = queue.global_map()
     assert found.spec == fused.spec
-    np.testing.assert_array_equal(found.owners > 0, fused.observed)
+    np.testing.assert_array_equal(found.owners > 0, fused.known)
     assert found.contributors[0] == ()
-    centres = found.spec.centers_of(np.argwhere(fused.observed)[::97])
+    centres = found.spec.centers_of(np.argwhere(fused.known)[::97])
     cells = found.spec.cells_of(centres)
     for record in queue.submaps():
         grid, T_map_submap = record.submap.grid, record.T_component_submap

@@ -189,7 +189,7 @@ def test_the_export_is_read_by_the_readers(tmp_path):
     answer_all(queue, KnowingMatcher(FLEET))
     paths = export_queue(tmp_path, queue)
     assert all(path.is_file() for path in paths)
-    fused = queue.global_map().to_occupancy()
+    fused = queue.global_map()
     read = read_map(tmp_path / "map.yaml")
     assert read.spec == fused.spec
     np.testing.assert_array_equal(read.values == 100, fused.values > 50)

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import UNITS_PER_NAT, GridSpec
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.fused_map import FusedMap, fuse
 from uw_dslam_ros2.core.mapping.grid_kernels import beam_table, diamond
-from uw_dslam_ros2.core.mapping.occupancy import UNITS_PER_NAT, GrowingGrid
+from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import Detections
 
@@ -175,51 +175,13 @@ def test_percent_is_the_logistic_function():
     assert (found.values == -1).any()
 
 
-def test_fusing_at_identity_gives_the_same_map_and_order_does_not_matter(rng):
-    parts = []
-    for _ in range(3):
-        grid = GrowingGrid(CONFIG)
-        grid.add(random_ping(rng), SE2(*rng.uniform(-1, 1, 3)))
-        parts.append((grid.trimmed(), SE2(*rng.uniform(-3, 3, 3))))
-    alone = fuse([(parts[0][0], SE2())], 4.0)
-    direct = parts[0][0].to_occupancy(4.0)
-    known = alone.values[alone.values >= 0]
-    assert sorted(known) == sorted(direct.values[direct.values >= 0])
-    for order in itertools.permutations(parts):
-        np.testing.assert_array_equal(fuse(order, 4.0).values, fuse(parts, 4.0).values)
-
-
-def test_nothing_to_fuse_is_an_error():
-    with pytest.raises(InvalidInputError, match="no grid"):
-        fuse([], 4.0)
-
-
-def test_what_has_moved_leaves_no_trace(rng):
-    parts = []
-    for _ in range(4):
-        grid = GrowingGrid(CONFIG)
-        grid.add(random_ping(rng), SE2(*rng.uniform(-1, 1, 3)))
-        parts.append(grid.trimmed())
-    last = [SE2(*rng.uniform(-3, 3, 3)) for _ in parts]
-    fused = FusedMap(CONFIG.resolution_m)
-    for _ in range(3):
-        for index, part in enumerate(parts):
-            # Far out, so that the map must grow and shrink again.
-            fused.place(index, part.packed(), SE2(*rng.uniform(-40, 40, 2), rng.uniform(-3, 3)))
-    for index, part in enumerate(parts):
-        fused.place(index, part.packed(), last[index])
-    fused.place(9, parts[0], SE2(1.0, 2.0, 0.5))
-    fused.remove(9, parts[0])
-    expected = fuse(zip(parts, last, strict=True), 4.0)
-    found = fused.to_occupancy(4.0)
-    np.testing.assert_array_equal(found.values, expected.values)
-    assert found.spec.T_frame_grid == expected.spec.T_frame_grid
-    assert fused.pose(1) == last[1]
-    assert fused.pose(9) is None
-
-
-def test_a_grid_of_another_resolution_is_named(rng):
+def test_a_packed_grid_is_drawn_as_the_grid_itself(rng):
     grid = GrowingGrid(CONFIG)
-    grid.add(random_ping(rng), SE2())
-    with pytest.raises(InvalidInputError, match=r"resolution is 0\.1 m, expected 0\.2 m"):
-        FusedMap(0.2).place(0, grid.trimmed(), SE2())
+    grid.add(random_ping(rng), SE2(3.0, 4.0, 1.0))
+    part = grid.trimmed()
+    direct = part.to_occupancy(4.0)
+    for drawable in (part, part.packed()):
+        fused = fuse_maps(GridSpec(CONFIG.resolution_m, 1, 1), [(drawable, SE2())], 4.0)
+        np.testing.assert_array_equal(fused.values, direct.values)
+        off = fused.spec.T_frame_grid.distance_to(direct.spec.T_frame_grid)
+        assert off == pytest.approx((0.0, 0.0), abs=1e-9)

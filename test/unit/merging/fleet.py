@@ -19,7 +19,5 @@ def three_vehicles(seed: int = 0, num_submaps: int = 4) -> Fleet:
 
 def map_bytes(queue: MapQueue) -> bytes:
     """Everything that the global map is, as bytes."""
-    evidence = queue.global_map()
-    if evidence is None:
-        return b""
-    return repr(evidence.spec).encode() + evidence.log_odds.tobytes() + evidence.observed.tobytes()
+    fused = queue.global_map()
+    return b"" if fused is None else repr(fused.spec).encode() + fused.values.tobytes()

@@ -134,7 +134,7 @@ def test_a_revision_replaces_the_evidence():
         submap.grid, values=np.where(submap.grid.known, 100, -1).astype("i1")
     )
     queue.add_submap(dataclasses.replace(submap, revision=3, grid=grid))
-    fused = queue.global_map().to_occupancy()
+    fused = queue.global_map()
     assert set(np.unique(fused.values) >= 99) == {False, True}
     assert set(np.unique(fused.values[fused.known]) >= 99) == {True}
 
@@ -196,7 +196,7 @@ def test_the_lattice_is_pinned_to_the_first_submap_and_never_moves():
 def test_a_lone_submap_is_copied_cell_by_cell():
     queue = filled([("auv_1", 0)])
     submap = FLEET.submaps["auv_1", 0]
-    fused = queue.global_map().to_occupancy()
+    fused = queue.global_map()
     cells = fused.spec.cells_of(submap.grid.spec.centers_of(np.argwhere(submap.grid.known)))
     expected = submap.grid.values[submap.grid.known]
     got = fused.values[cells[:, 0], cells[:, 1]]

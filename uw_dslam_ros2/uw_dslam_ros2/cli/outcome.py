@@ -193,12 +193,11 @@ def outcome_of(queue: MapQueue) -> Outcome:
                 (others or merged)[0].reason,
             )
         )
-    evidence = queue.global_map()
     return Outcome(
         tuple(vehicles),
         tuple(records),
         tuple(queue.constraints()),
-        None if evidence is None else evidence.to_occupancy(),
+        queue.global_map(),
         tuple(
             RegistrationRow.of(number, answer, is_used)
             for number, (answer, is_used) in enumerate(queue.answers(), start=1)
@@ -213,12 +212,12 @@ def _alone(submaps: list[Submap]) -> tuple[OccupancyMap, Trajectory]:
     queue = MapQueue()
     for submap in submaps:
         queue.add_submap(submap)
-    evidence = queue.global_map()
-    assert evidence is not None  # it holds at least the first submap
+    occupancy = queue.global_map()
+    assert occupancy is not None  # it holds at least the first submap
     stamps_poses = queue.trajectories().get(submaps[0].vehicle_id)
     if stamps_poses is None:
         stamps_poses = np.empty(0, np.int64), np.empty((0, 3))
-    return evidence.to_occupancy(), stamps_poses
+    return occupancy, stamps_poses
 
 
 def write_outcome(folder: Path, outcome: Outcome) -> None:

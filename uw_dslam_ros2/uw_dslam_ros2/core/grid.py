@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -11,12 +12,27 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["FREE", "OCCUPIED", "UNKNOWN", "EvidenceGrid", "GridSpec", "OccupancyMap"]
+__all__ = [
+    "FREE",
+    "OCCUPIED",
+    "UNITS_PER_NAT",
+    "UNKNOWN",
+    "UNSEEN",
+    "GridSpec",
+    "OccupancyMap",
+    "percent_table",
+]
 
 FloatArray = NDArray[np.float64]
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Values of an occupancy map: -1 unknown, else the probability of being occupied in percent."""
+
+UNITS_PER_NAT = 1000.0
+"""Evidence is summed in integers of a thousandth of a nat: the same in any order."""
+
+UNSEEN = np.int16(-32768)
+"""Instead of evidence: nothing was observed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,35 +117,24 @@ class OccupancyMap:
         """Cells that were observed."""
         return self.values >= 0
 
+    def units(self) -> NDArray[np.int16]:
+        """Evidence (R, C) in units of `UNITS_PER_NAT`, `UNSEEN` where unknown.
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EvidenceGrid:
-    """An occupancy grid as it is computed: natural log-odds, positive means occupied.
+        0 and 100 count as half a percent from certainty.
+        """
+        return np.where(self.known, _UNITS_OF_PERCENT[self.values], UNSEEN)
 
-    ``log_odds`` is float32 of ``spec.shape``. ``observed`` is a mask of its own, because log-odds
-    0 may also mean echoes that contradict each other.
-    """
 
-    spec: GridSpec
-    log_odds: NDArray[np.float32]
-    observed: NDArray[np.bool_]
+_PROBABILITY = np.clip(np.arange(101) / 100.0, 0.005, 0.995)
+_UNITS_OF_PERCENT = np.rint(UNITS_PER_NAT * np.log(_PROBABILITY / (1.0 - _PROBABILITY))).astype(
+    np.int16
+)
 
-    def __post_init__(self) -> None:
-        for name in ("log_odds", "observed"):
-            shape = getattr(self, name).shape
-            if shape != self.spec.shape:
-                raise InvalidInputError(f"{name} has shape {shape}, expected {self.spec.shape}")
 
-    def to_occupancy(self) -> OccupancyMap:
-        """Probability in percent, rounded; unobserved cells are -1."""
-        probability = 1.0 / (1.0 + np.exp(-self.log_odds.astype(np.float64)))
-        percent = np.rint(100.0 * probability).astype(np.int8)
-        return OccupancyMap(self.spec, np.where(self.observed, percent, np.int8(UNKNOWN)))
-
-    @classmethod
-    def from_occupancy(cls, occupancy: OccupancyMap) -> EvidenceGrid:
-        """Undo `to_occupancy` up to its rounding; 0 and 100 become half a percent from there."""
-        probability = np.clip(occupancy.values.astype(np.float64) / 100.0, 0.005, 0.995)
-        log_odds = np.log(probability / (1.0 - probability))
-        known = occupancy.known
-        return cls(occupancy.spec, np.where(known, log_odds, 0.0).astype(np.float32), known.copy())
+@functools.cache
+def percent_table(log_odds_max: float) -> NDArray[np.int8]:
+    """Percent of each whole number of units whose log-odds are within a limit, the least first."""
+    limit = int(log_odds_max * UNITS_PER_NAT)
+    # A table instead of millions of exponentials.
+    percent = 100.0 / (1.0 + np.exp(-np.arange(-limit, limit + 1) / UNITS_PER_NAT))
+    return np.rint(percent).astype(np.int8)

@@ -108,9 +108,9 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
     """
     folder = Path(folder)
     written: list[Path] = []
-    evidence = queue.global_map()
-    if evidence is not None:
-        written += write_map(folder / "map", evidence.to_occupancy())
+    occupancy = queue.global_map()
+    if occupancy is not None:
+        written += write_map(folder / "map", occupancy)
     provenance = queue.provenance()
     if provenance is not None:
         written += write_provenance(folder / "map", provenance)

@@ -43,13 +43,13 @@ from uw_dslam_ros2.cli.studies._fleet_missions import (
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest
-from uw_dslam_ros2.core.merging.fusion import fuse_maps
 from uw_dslam_ros2.core.metrics import (
     compare_maps,
     interpolate_poses,
     map_sharpness,
     trajectory_error,
 )
+from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.registration import RegistrationResult, register_grids
 from uw_dslam_ros2.core.registration.baselines.icp import many_start_icp
 from uw_dslam_ros2.core.registration.baselines.ndt import ndt

@@ -118,10 +118,10 @@ def _trial(fleet: Fleet, matcher: Matcher, seed: int, order: int, mode: str) -> 
 
 
 def _digest_of(queue: MapQueue) -> str:
-    evidence = queue.global_map()
-    assert evidence is not None
-    content = evidence.log_odds.tobytes() + evidence.observed.tobytes()
-    return hashlib.blake2b(repr(evidence.spec).encode() + content, digest_size=8).hexdigest()
+    fused = queue.global_map()
+    assert fused is not None
+    content = repr(fused.spec).encode() + fused.values.tobytes()
+    return hashlib.blake2b(content, digest_size=8).hexdigest()
 
 
 def _draw(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["NUM_DIRECTIONS", "add_ping", "beam_table", "diamond", "resample_add"]
+__all__ = ["NUM_DIRECTIONS", "add_ping", "beam_table", "diamond"]
 
 NUM_DIRECTIONS = 16384
 _SLOTS_PER_BIN = 16
@@ -264,44 +264,3 @@ def add_ping(  # type: ignore[no-untyped-def]
                 echo[row, col] = value
     for k in range(num_touched):
         echo[touched_rows[k], touched_cols[k]] = 0
-
-
-@njit(cache=True, nogil=True)
-def resample_add(  # type: ignore[no-untyped-def]
-    target, target_count, target_row, target_col,
-    source, source_observed, source_row, source_col,
-    x, y, yaw, resolution, sign,
-):  # fmt: skip
-    """Add a grid at pose (x, y, yaw) to the target: each target cell takes its nearest cell.
-
-    The count is of the grids that observed a cell; a `sign` of -1 takes the grid out again.
-    """
-    num_rows, num_cols = target.shape
-    source_rows, source_cols = source.shape
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    # Window of the target that the source can reach.
-    low_x, high_x, low_y, high_y = np.inf, -np.inf, np.inf, -np.inf
-    for corner in range(4):
-        cx = (source_col + (source_cols if corner % 2 else 0)) * resolution
-        cy = (source_row + (source_rows if corner // 2 else 0)) * resolution
-        px, py = x + cos * cx - sin * cy, y + sin * cx + cos * cy
-        low_x, high_x, low_y, high_y = (
-            min(low_x, px),
-            max(high_x, px),
-            min(low_y, py),
-            max(high_y, py),
-        )
-    c0 = max(0, int(np.floor(low_x / resolution)) - target_col)
-    c1 = min(num_cols - 1, int(np.floor(high_x / resolution)) - target_col)
-    r0 = max(0, int(np.floor(low_y / resolution)) - target_row)
-    r1 = min(num_rows - 1, int(np.floor(high_y / resolution)) - target_row)
-    for row in range(r0, r1 + 1):
-        dy = (target_row + row + 0.5) * resolution - y
-        for col in range(c0, c1 + 1):
-            dx = (target_col + col + 0.5) * resolution - x
-            lx, ly = cos * dx + sin * dy, -sin * dx + cos * dy
-            i = int(np.floor(ly / resolution)) - source_row
-            j = int(np.floor(lx / resolution)) - source_col
-            if 0 <= i < source_rows and 0 <= j < source_cols and source_observed[i, j]:
-                target[row, col] += sign * source[i, j]
-                target_count[row, col] += sign

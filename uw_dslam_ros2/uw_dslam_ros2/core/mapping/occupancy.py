@@ -10,17 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import (
+    UNITS_PER_NAT,
+    UNKNOWN,
+    UNSEEN,
+    GridSpec,
+    OccupancyMap,
+    percent_table,
+)
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.mapping.grid_kernels import NUM_DIRECTIONS, add_ping, beam_table
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import Detections
 
-__all__ = ["UNITS_PER_NAT", "GrowingGrid", "PackedEvidence", "SparseEvidence"]
-
-UNITS_PER_NAT = 1000.0
-"""Evidence is counted in integers of a thousandth of a nat, so that sums are exact in any
-order."""
+__all__ = ["GrowingGrid", "PackedEvidence", "SparseEvidence"]
 
 _MAX_SPREAD_M = 0.5
 """Largest half width of an echo across the beam: far off, a wide one would paint whole arcs."""
@@ -42,13 +45,16 @@ class SparseEvidence:
     col: int
     resolution_m: float
 
-    def corners(self) -> NDArray[np.float64]:
-        """Outer corners (4, 2) [m]."""
-        num_rows, num_cols = self.evidence.shape
-        cells = [
-            (self.col + i * num_cols, self.row + j * num_rows) for i in (0, 1) for j in (0, 1)
-        ]
-        return np.array(cells) * self.resolution_m
+    @property
+    def spec(self) -> GridSpec:
+        """Where it lies."""
+        return _spec_of(self.evidence.shape, self.row, self.col, self.resolution_m)
+
+    def units(self) -> NDArray[np.int16]:
+        """Evidence (R, C), cut at 32 nats; `UNSEEN` where nothing was observed."""
+        return np.where(self.observed, np.clip(self.evidence, -32767, 32767), UNSEEN).astype(
+            np.int16
+        )
 
     def trimmed(self) -> SparseEvidence:
         """A copy of the observed part, at least one cell."""
@@ -68,31 +74,15 @@ class SparseEvidence:
 
     def to_occupancy(self, log_odds_max: float) -> OccupancyMap:
         """Probability in percent."""
-        num_rows, num_cols = self.evidence.shape
-        spec = GridSpec(
-            self.resolution_m,
-            num_rows,
-            num_cols,
-            SE2(self.col * self.resolution_m, self.row * self.resolution_m, 0.0),
-        )
-        limit = int(log_odds_max * UNITS_PER_NAT)
-        # A table instead of millions of exponentials.
-        percent = 100.0 / (1.0 + np.exp(-np.arange(-limit, limit + 1) / UNITS_PER_NAT))
-        table = np.rint(percent).astype(np.int8)
+        table = percent_table(log_odds_max)
+        limit = len(table) // 2
         values = table[np.clip(self.evidence, -limit, limit) + limit]
-        return OccupancyMap(spec, np.where(self.observed, values, np.int8(UNKNOWN)))
+        return OccupancyMap(self.spec, np.where(self.observed, values, np.int8(UNKNOWN)))
 
     def packed(self) -> PackedEvidence:
         """Compressed for keeping; evidence is cut at 32 nats."""
-        evidence = np.clip(self.evidence, -32767, 32767).astype(np.int16)
-        evidence[~self.observed] = -32768
-        return PackedEvidence(
-            zlib.compress(evidence.tobytes(), 1),
-            self.evidence.shape,
-            self.row,
-            self.col,
-            self.resolution_m,
-        )
+        data = zlib.compress(self.units().tobytes(), 1)
+        return PackedEvidence(data, self.evidence.shape, self.row, self.col, self.resolution_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,17 +95,25 @@ class PackedEvidence:
     col: int
     resolution_m: float
 
+    @property
+    def spec(self) -> GridSpec:
+        """Where it lies."""
+        return _spec_of(self.shape, self.row, self.col, self.resolution_m)
+
+    def units(self) -> NDArray[np.int16]:
+        """Evidence (R, C); `UNSEEN` where nothing was observed."""
+        return np.frombuffer(zlib.decompress(self.data), np.int16).reshape(self.shape).copy()
+
     def unpacked(self) -> SparseEvidence:
         """The grid again."""
-        evidence = np.frombuffer(zlib.decompress(self.data), np.int16).reshape(self.shape)
-        observed = evidence != -32768
-        return SparseEvidence(
-            np.where(observed, evidence, 0).astype(np.int32),
-            observed,
-            self.row,
-            self.col,
-            self.resolution_m,
-        )
+        units = self.units()
+        observed = units != UNSEEN
+        evidence = np.where(observed, units, 0).astype(np.int32)
+        return SparseEvidence(evidence, observed, self.row, self.col, self.resolution_m)
+
+
+def _spec_of(shape: tuple[int, int], row: int, col: int, resolution_m: float) -> GridSpec:
+    return GridSpec(resolution_m, *shape, SE2(col * resolution_m, row * resolution_m))
 
 
 class GrowingGrid:

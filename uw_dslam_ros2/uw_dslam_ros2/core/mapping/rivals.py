@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.grid import UNITS_PER_NAT
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points
-from uw_dslam_ros2.core.mapping.occupancy import UNITS_PER_NAT, PackedEvidence, SparseEvidence
+from uw_dslam_ros2.core.mapping.occupancy import PackedEvidence, SparseEvidence
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.se2 import SE2
 

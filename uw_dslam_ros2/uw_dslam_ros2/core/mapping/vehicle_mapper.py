@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.estimators import make_estimator
-from uw_dslam_ros2.core.mapping.fused_map import FusedMap
 from uw_dslam_ros2.core.mapping.local_map import LocalMap
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
+from uw_dslam_ros2.core.mosaic import Mosaic
 from uw_dslam_ros2.core.navigation import NavigationFilter
 from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2
@@ -53,7 +53,7 @@ class VehicleMapper:
         self._navigation = NavigationFilter(config.navigation)
         self._estimator = make_estimator(config)
         self._local_map = LocalMap(config.match)
-        self._fused = FusedMap(config.occupancy.resolution_m)
+        self._mosaic = Mosaic(GridSpec(config.occupancy.resolution_m, 1, 1))
         self._closed: list[ClosedSection] = []
         self._open: OpenSection | None = None
         self._pending: list[tuple[int, int, Detections, SE2]] = []
@@ -219,17 +219,16 @@ class VehicleMapper:
         """
         if not self._closed and self._open is None:
             raise InvalidInputError("there is no map yet, expected a ping with navigation first")
-        fused = self._fused
+        mosaic, newest = self._mosaic, len(self._closed)
         for index, section in enumerate(self._closed):
-            if fused.pose(index) != section.T_odom_issued:
-                fused.place(index, section.evidence, section.T_odom_issued)
-        if self._open is None:
-            return fused.to_occupancy(self._config.occupancy.log_odds_max)
-        grid, newest = self._open.grid.trimmed(), len(self._closed)
-        fused.place(newest, grid, self._estimator.poses[newest])
-        occupancy = fused.to_occupancy(self._config.occupancy.log_odds_max)
-        fused.remove(newest, grid)
-        return occupancy
+            pose = section.T_odom_issued
+            if mosaic.version_of(index) != pose:
+                mosaic.put(index, pose, section.evidence, pose)
+        if self._open is not None:
+            mosaic.put(newest, None, self._open.grid.trimmed(), self._estimator.poses[newest])
+        occupancy = mosaic.occupancy(self._config.occupancy.log_odds_max)
+        mosaic.remove(newest)
+        return occupancy or OccupancyMap(mosaic.lattice, np.full((1, 1), UNKNOWN, np.int8))
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counters and the filter's beliefs, by name."""

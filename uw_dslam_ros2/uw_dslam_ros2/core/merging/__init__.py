@@ -1,7 +1,6 @@
 """Many submaps of many vehicles, in any order, into one map."""
 
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
-from uw_dslam_ros2.core.merging.fusion import Mosaic, Window
 from uw_dslam_ros2.core.merging.queue import MapQueue
 from uw_dslam_ros2.core.merging.settling import LoopError
 from uw_dslam_ros2.core.merging.state import QueueState
@@ -22,9 +21,7 @@ __all__ = [
     "MapQueue",
     "MapQueueConfig",
     "MatchRequest",
-    "Mosaic",
     "QueueState",
     "SubmapRecord",
     "SubmapState",
-    "Window",
 ]

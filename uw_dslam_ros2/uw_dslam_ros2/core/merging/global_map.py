@@ -7,21 +7,22 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
-from uw_dslam_ros2.core.merging.fusion import Mosaic, Window, render_patch, snap_pose
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.types import MapProvenance
 from uw_dslam_ros2.core.merging.units import StoredSubmap
+from uw_dslam_ros2.core.mosaic import Mosaic, Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
-__all__ = ["GlobalMap", "pinned_lattice"]
+__all__ = ["GlobalMap", "pinned_lattice", "snap_pose"]
 
 
 class GlobalMap:
     """A mosaic of submaps in frame "map"."""
 
     def __init__(self, lattice: GridSpec, log_odds_max: float) -> None:
-        self._mosaic = Mosaic(lattice, log_odds_max)
+        self._mosaic = Mosaic(lattice)
+        self._log_odds_max = log_odds_max
 
     def draw(
         self, submaps: Mapping[SubmapId, StoredSubmap], T_map_submap: Mapping[SubmapId, SE2]
@@ -35,12 +36,11 @@ class GlobalMap:
             snapped = snap_pose(motion, mosaic.lattice.resolution_m, stored.radius_m)
             version = (stored.digest, snapped)
             if mosaic.version_of(submap_id) != version:
-                patch = render_patch(mosaic.lattice, stored.submap.grid, snapped)
-                mosaic.put(submap_id, version, patch)
+                mosaic.put(submap_id, version, stored.submap.grid, snapped)
 
-    def evidence(self) -> EvidenceGrid | None:
+    def occupancy(self) -> OccupancyMap | None:
         """The fused map; None without evidence."""
-        return self._mosaic.evidence()
+        return self._mosaic.occupancy(self._log_odds_max)
 
     def take_changed(self) -> tuple[GridSpec, Window] | None:
         """What changed since the last call: its place as a grid, and in cells of the lattice."""
@@ -74,3 +74,17 @@ def pinned_lattice(spec: GridSpec, resolution_m: float) -> GridSpec:
     corner = turn.inverse().apply(spec.T_frame_grid.as_array()[:2]) / resolution_m
     phase: NDArray[np.float64] = np.round(corner - np.floor(corner + 1e-6), 9) * resolution_m
     return GridSpec(resolution_m, 1, 1, turn @ SE2(float(phase[0]), float(phase[1])))
+
+
+def snap_pose(motion: SE2, resolution_m: float, radius_m: float) -> SE2:
+    """Round a pose so finely that no point within `radius_m` moves by more than a tenth of a cell.
+
+    Poses that differ in rounding errors only are drawn alike, and need not be drawn again.
+    """
+    step_m = 0.1 * resolution_m
+    step_rad = step_m / max(radius_m, resolution_m)
+    return SE2(
+        step_m * round(motion.x / step_m),
+        step_m * round(motion.y / step_m),
+        step_rad * round(motion.yaw / step_rad),
+    )

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import EvidenceGrid, GridSpec
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MapQueueConfig
-from uw_dslam_ros2.core.merging.fusion import Window
 from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
 from uw_dslam_ros2.core.merging.growing import make_growing_plan
 from uw_dslam_ros2.core.merging.library import Library, Memory
@@ -28,6 +27,7 @@ from uw_dslam_ros2.core.merging.types import (
     SubmapRecord,
 )
 from uw_dslam_ros2.core.merging.units import StoredSubmap
+from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
@@ -195,10 +195,10 @@ class MapQueue:
         plan = self._plan()
         return loop_errors(plan.odometry, [joint for joint in plan.joints if joint.is_inlier])
 
-    def global_map(self) -> EvidenceGrid | None:
+    def global_map(self) -> OccupancyMap | None:
         """The fused map in frame "map"; None before there is any evidence."""
         drawn = self._drawn()
-        return None if drawn is None else drawn.evidence()
+        return None if drawn is None else drawn.occupancy()
 
     def provenance(self) -> MapProvenance | None:
         """Who saw what in the global map, and where they disagree; None without evidence."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging.fusion import render_patch
+from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["warm_up"]
@@ -15,4 +15,4 @@ def warm_up() -> None:
     """Run every kernel on tiny input."""
     values = np.array([[0, 100], [-1, 0]], dtype=np.int8)
     occupancy = OccupancyMap(GridSpec(0.1, 2, 2), values)
-    render_patch(GridSpec(0.1, 1, 1), occupancy, SE2(0.0, 0.0, 0.5))
+    fuse_maps(GridSpec(0.1, 1, 1), [(occupancy, SE2(0.0, 0.0, 0.5))], 8.0)

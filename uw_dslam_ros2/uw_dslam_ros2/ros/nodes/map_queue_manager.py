@@ -267,9 +267,9 @@ class MapQueueManager(Node):
         changed = self._queue.changed_window()
         if changed is None:
             return
-        evidence = self._queue.global_map()
-        if evidence is not None:
-            self._map.publish(evidence.to_occupancy(), changed[0], self._now())
+        occupancy = self._queue.global_map()
+        if occupancy is not None:
+            self._map.publish(occupancy, changed[0], self._now())
 
     def _publish_status(self) -> None:
         self._status_s = time.monotonic()

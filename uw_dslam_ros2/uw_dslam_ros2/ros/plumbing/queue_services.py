@@ -93,14 +93,14 @@ class QueueServices:
         return response
 
     def _save_map(self, request: SaveMap.Request, response: SaveMap.Response) -> None:
-        evidence = self._owner.queue.global_map()
-        if evidence is None:
+        occupancy = self._owner.queue.global_map()
+        if occupancy is None:
             response.result = response.NOTHING_TO_SAVE
             response.message = "no submap received yet"
             return
         if not request.path:
             raise InvalidInputError("path is empty, expected a file name without an ending")
-        paths = write_map(request.path, evidence.to_occupancy())
+        paths = write_map(request.path, occupancy)
         provenance = self._owner.queue.provenance()
         if provenance is not None:
             paths += write_provenance(request.path, provenance)
