@@ -7,12 +7,14 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from unit.cli import missions
 
 from uw_dslam_ros2.cli import common, evaluate, offline, register
 from uw_dslam_ros2.cli.outcome import write_outcome
 from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration import Verdict
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.trajectories import write_tum
@@ -155,6 +157,23 @@ def test_register_tells_the_verdict_by_its_exit_code(tmp_path, monkeypatch, caps
     assert plain["seconds"] is None
     assert answers["prior"].half_width_m == 3.0
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_register_makes_up_no_pose_where_none_was_judged(tmp_path, capsys) -> None:
+    unknown = OccupancyMap(GridSpec(0.05, 40, 50), np.full((40, 50), -1, np.int8))
+    write_map(tmp_path / "a", unknown)
+    maps, picture = [str(tmp_path / "a.yaml")] * 2, tmp_path / "overlay.png"
+    code = register.EXIT_CODES[Verdict.TOO_FEW_FEATURES]
+    assert register.main([*maps, "--out", str(picture)]) == code
+    said = capsys.readouterr()
+    assert "TOO_FEW_FEATURES, refused before any pose was judged" in said.out
+    assert "no picture" in said.err
+    assert not picture.exists()
+    assert register.main([*maps, "--json"]) == code
+    plain = json.loads(capsys.readouterr().out)
+    assert plain["T_target_source"] is None
+    assert plain["covariance"] == [[None] * 3] * 3
+    assert (plain["score"], plain["lower_bound"], plain["upper_bound"]) == (None, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(

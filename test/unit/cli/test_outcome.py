@@ -5,14 +5,19 @@ from __future__ import annotations
 import csv
 import filecmp
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from unit.cli import missions
 
-from uw_dslam_ros2.cli.outcome import names_of, outcome_of, write_outcome
+from uw_dslam_ros2.cli.outcome import RegistrationRow, names_of, outcome_of, write_outcome
+from uw_dslam_ros2.cli.report import RunFacts, render_html
+from uw_dslam_ros2.cli.scoring import score
 from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.session import load_session, save_session
@@ -56,6 +61,26 @@ def test_the_numbers_of_an_answer_are_listed_and_survive_a_session(tmp_path: Pat
             assert (row.score, row.lower_bound, row.upper_bound) == (0.5, 0.5, 0.52)
             assert row.gap == pytest.approx(0.02 / 0.52)
             assert (row.num_boxes, row.is_certified, row.num_target_points) == (1234, True, 120)
+
+
+def test_a_refusal_without_a_pose_is_listed_without_numbers(tmp_path: Path) -> None:
+    queue = missions.settled_queue()
+    few = RegistrationResult.refused(Verdict.TOO_FEW_FEATURES, "few")
+    answers = [Answer.of(answer.match, few) for answer, _ in queue.answers()]
+    outcome = replace(
+        outcome_of(queue),
+        registrations=tuple(RegistrationRow.of(k, a, False) for k, a in enumerate(answers)),
+    )
+    write_outcome(tmp_path, outcome)
+    rows = json.loads((tmp_path / "registrations.json").read_text())
+    assert len(rows) == len(answers) > 0
+    for row in rows:
+        assert (row["verdict"], row["reason"]) == ("TOO_FEW_FEATURES", "few")
+        assert {row[name] for name in ("x", "y", "yaw", "sigma_x", "score", "overlap")} == {None}
+    with (tmp_path / "registrations.csv").open() as file:
+        assert {row["x"] for row in csv.DictReader(file)} == {""}
+    facts = RunFacts("title", [], "", {}, {}, {})
+    assert "few" in render_html(outcome, facts, score(None, {}, {}, None), {"before_after": b""})
 
 
 def test_files_hold_the_outcome(tmp_path: Path) -> None:

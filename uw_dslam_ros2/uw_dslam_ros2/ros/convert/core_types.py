@@ -156,8 +156,10 @@ def transform2d_from_msg(msg: Transform2D, name: str) -> SE2:
     return SE2(msg.x, msg.y, msg.yaw)
 
 
-def transform2d_to_msg(T_target_source: SE2) -> Transform2D:
-    """Rigid motion as a message."""
+def transform2d_to_msg(T_target_source: SE2 | None) -> Transform2D:
+    """Rigid motion as a message; all NaN where there is none."""
+    if T_target_source is None:
+        return Transform2D(x=math.nan, y=math.nan, yaw=math.nan)
     return Transform2D(x=T_target_source.x, y=T_target_source.y, yaw=T_target_source.yaw)
 
 

@@ -82,7 +82,7 @@ _PLAIN_FLOATS = (
 def registration_to_msg(result: RegistrationResult) -> Registration:
     """Message of a registration's outcome."""
     msg = Registration(verdict=int(result.verdict), reason=result.reason)
-    msg.t_target_source = _transform_to_msg(result.T_target_source)
+    msg.t_target_source = transform2d_to_msg(result.T_target_source)
     msg.covariance = covariance_to_list(result.covariance)
     for name in _PLAIN_FLOATS:
         setattr(msg, name, float(getattr(result, name)))
@@ -93,12 +93,6 @@ def registration_to_msg(result: RegistrationResult) -> Registration:
     msg.num_target_points = int(result.num_target_points)
     msg.rivals = [_rival_to_msg(rival) for rival in result.rivals]
     return msg
-
-
-def _transform_to_msg(T_target_source: SE2 | None) -> Transform2D:
-    if T_target_source is None:
-        return Transform2D(x=math.nan, y=math.nan, yaw=math.nan)
-    return transform2d_to_msg(T_target_source)
 
 
 def _transform_from_msg(msg: Transform2D, verdict: Verdict, name: str) -> SE2 | None:

@@ -21,7 +21,6 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from uw_dslam_msgs.action import RegisterMaps as RegisterMapsAction
-from uw_dslam_msgs.msg import Transform2D
 from uw_dslam_msgs.srv import RegisterMaps, RegisterPointSets
 
 from uw_dslam_ros2.core.config import Config
@@ -279,13 +278,12 @@ def adapted[ConfigT: Config](config: ConfigT, max_seconds: float, **given: float
 
 def _feedback(progress: Progress | None, seconds: float) -> RegisterMapsAction.Feedback:
     if progress is None:  # before the search, nothing is proven and no pose is known
-        nowhere = Transform2D(x=math.nan, y=math.nan, yaw=math.nan)
         return RegisterMapsAction.Feedback(
             stage="features",
             upper_bound=1.0,
             gap=1.0,
             seconds=float(seconds),
-            t_target_source=nowhere,
+            t_target_source=transform2d_to_msg(None),
         )
     return RegisterMapsAction.Feedback(
         stage=progress.stage,
