@@ -185,6 +185,21 @@ def test_different_places_are_refused():
     assert not register_grids(pair.source, pair.target).is_accepted
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of the mean of no other peaks
+def test_different_places_on_large_canvases_are_refused():
+    """Little is left of the walls on the searched lattice: not even chance has a peak there."""
+    pair = make_pair("office", 0.7, "clean", 1, is_matching=False)
+    maps = []
+    for grid, (row, col) in ((pair.source, (1900, 1300)), (pair.target, (2000, 2000))):
+        values = np.full((4000, 4000), -1, np.int8)
+        rows, cols = grid.spec.shape
+        values[row : row + rows, col : col + cols] = grid.values
+        maps.append(OccupancyMap(GridSpec(grid.spec.resolution_m, 4000, 4000), values))
+    result = register_grids(*maps)
+    assert not result.is_accepted, result.reason
+    assert np.isfinite(result.probability)
+
+
 @pytest.mark.parametrize(
     "values",
     [

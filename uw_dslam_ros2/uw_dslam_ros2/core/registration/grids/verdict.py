@@ -60,7 +60,7 @@ class _Case:
     ) -> None:
         self.evidence, self.config, self.models, self.proof = evidence, config, models, proof
         self.agreement = evidence.best.agreement
-        self.not_finite = ", ".join(_not_finite(evidence, proof))
+        self.not_finite = next(_not_finite(evidence, proof), "")
         self.probability = 0.0 if self.not_finite else probability_of(evidence, models)
         self.is_probable = self.probability >= config.min_probability
         self.max_conflict = config.max_conflict

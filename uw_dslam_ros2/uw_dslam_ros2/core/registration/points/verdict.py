@@ -66,8 +66,8 @@ class PointCase:
 
     @cached_property
     def not_finite(self) -> str:
-        """What should be a number and is not, with its value; empty where all are."""
-        return ", ".join(_not_finite(self))
+        """The first number that is not finite, with its value; empty where all are."""
+        return next(_not_finite(self), "")
 
     @cached_property
     def probability(self) -> float:
