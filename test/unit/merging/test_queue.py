@@ -11,7 +11,7 @@ from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, SubmapState
-from uw_dslam_ros2.core.merging.settling import Joint, loop_errors
+from uw_dslam_ros2.core.merging.settling import Constraint, loop_errors
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
@@ -425,9 +425,9 @@ def test_loops_are_measured_in_metres_and_radians():
     """A cycle with one edge that is off by a known amount fails to close by that amount."""
     exact = np.diag([1e-4, 1e-4, 1e-6])
     odometry = [Edge(("a", 1), ("a", 0), SE2(4.0, 0.0, 0.5), exact)]
-    joints = [
-        Joint((b"1", b"", ()), Edge(("b", 0), ("a", 0), SE2(1.0, 2.0, 0.3), exact), 0.99),
-        Joint(
+    constraints = [
+        Constraint((b"1", b"", ()), Edge(("b", 0), ("a", 0), SE2(1.0, 2.0, 0.3), exact), 0.99),
+        Constraint(
             (b"2", b"", ()),
             Edge(
                 ("b", 0),
@@ -438,7 +438,7 @@ def test_loops_are_measured_in_metres_and_radians():
             0.9,
         ),
     ]
-    (loop,) = loop_errors(odometry, joints)
+    (loop,) = loop_errors(odometry, constraints)
     assert set(loop.submaps) == {("a", 0), ("a", 1), ("b", 0)}
     assert loop.error_rad == pytest.approx(0.1)
     assert loop.error_m == pytest.approx(0.5, abs=0.15)

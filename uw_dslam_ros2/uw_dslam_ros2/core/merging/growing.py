@@ -27,7 +27,7 @@ from uw_dslam_ros2.core.merging.config import NUM_NEIGHBOURS, VAGUE_CELLS, MapQu
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers, most_promising
-from uw_dslam_ros2.core.merging.settling import Component, Joint
+from uw_dslam_ros2.core.merging.settling import Component, Constraint
 from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.submap import SubmapId
 
@@ -69,21 +69,23 @@ class _GrowingPlanner:
 
     def run(self) -> Plan:
         """Work the plan out; the steps of the module's description."""
-        joints = [self._verifier.joint(answer) for answer in self._standing]
-        settled, components = self._settle(joints)
+        constraints = [self._verifier.constraint(answer) for answer in self._standing]
+        settled, components = self._settle(constraints)
         for pair in self._apart(components):
-            joints += self._check_claims(pair)
-        settled, components = self._settle(joints)
+            constraints += self._check_claims(pair)
+        settled, components = self._settle(constraints)
         if not self._verifier.wanted:
             self._ask_best(self._apart(components))
         for component in components:
-            joints += self._tie_newest(component, settled)
-        settled, components = self._settle(joints)
+            constraints += self._tie_newest(component, settled)
+        settled, components = self._settle(constraints)
         wanted = list(self._verifier.wanted.values())
         return Plan(wanted, settled, self._library.odometry.edges, components)
 
-    def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
-        return self._library.settle(self._anchor, joints)
+    def _settle(
+        self, constraints: Sequence[Constraint]
+    ) -> tuple[list[Constraint], list[Component]]:
+        return self._library.settle(self._anchor, constraints)
 
     def _apart(self, components: Sequence[Component]) -> list[Pair]:
         """The best pairs of vehicles of different components, the most promising first."""
@@ -100,8 +102,8 @@ class _GrowingPlanner:
         pairs.sort(key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
         return most_promising(pairs, self._config.max_partners)
 
-    def _check_claims(self, pair: Pair) -> list[Joint]:
-        """Joints of earlier answers that may be right, the one of the largest maps first."""
+    def _check_claims(self, pair: Pair) -> list[Constraint]:
+        """Constraints of earlier answers that may be right, the one of the largest maps first."""
         for answer in self._claims.get(pair, ()):
             if answer.use < Use.CLAIM:
                 continue
@@ -109,9 +111,9 @@ class _GrowingPlanner:
                 self._library.side_of(unit.ids)
                 for unit in (answer.match.source, answer.match.target)
             ]
-            joints = self._verifier.joints_of(answer.match, sides[0], sides[1])
-            if joints or self._verifier.wanted:
-                return joints
+            constraints = self._verifier.constraints_of(answer.match, sides[0], sides[1])
+            if constraints or self._verifier.wanted:
+                return constraints
         return []
 
     def _ask_best(self, pairs: Iterable[Pair]) -> None:
@@ -128,7 +130,9 @@ class _GrowingPlanner:
         asked = max((_size(answer) for answer in self._claims.get(pair, ())), default=0)
         return now >= self._config.growth**2 * asked and now > asked
 
-    def _tie_newest(self, component: Component, joints: Sequence[Joint]) -> list[Joint]:
+    def _tie_newest(
+        self, component: Component, constraints: Sequence[Constraint]
+    ) -> list[Constraint]:
         """Step 4: the newest place of each vehicle whose neighbours are there."""
         side = self._library.component_side(component)
         reach = NUM_NEIGHBOURS
@@ -136,9 +140,9 @@ class _GrowingPlanner:
         for vehicle in {submap_id[0] for submap_id in side.T_frame_submap}:
             ids = self._library.closed(vehicle)
             newest.add(ids[max(0, len(ids) - 1 - reach)])
-        inliers = [joint for joint in joints if joint.is_inlier]
+        inliers = [constraint for constraint in constraints if constraint.is_inlier]
         vague_cells = self._config.growth * VAGUE_CELLS
-        return self._verifier.joints_where_vague(side, inliers, vague_cells, 1, newest)
+        return self._verifier.constraints_where_vague(side, inliers, vague_cells, 1, newest)
 
 
 def _claims(library: Library, answers: Iterable[Answer]) -> dict[Pair, list[Answer]]:

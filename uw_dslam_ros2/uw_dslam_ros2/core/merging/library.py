@@ -15,7 +15,7 @@ from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, LOG_ODDS_MAX, 
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.descriptors import MapShape, shape_of
 from uw_dslam_ros2.core.merging.odometry import Odometry
-from uw_dslam_ros2.core.merging.settling import Component, Joint, settle
+from uw_dslam_ros2.core.merging.settling import Component, Constraint, settle
 from uw_dslam_ros2.core.merging.units import StoredSubmap, Unit, render_unit, shared_area_m2
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
@@ -182,11 +182,11 @@ class Library:
         return self._remember(key, lambda: shared_area_m2(first, second, T_target_source))
 
     def settle(
-        self, anchor: SubmapId, joints: Sequence[Joint]
-    ) -> tuple[list[Joint], list[Component]]:
+        self, anchor: SubmapId, constraints: Sequence[Constraint]
+    ) -> tuple[list[Constraint], list[Component]]:
         """Solve the pose graph; see `settling.settle`."""
         # One answer may serve several matches; it is one edge.
-        unique = {joint.key: joint for joint in joints}
+        unique = {constraint.key: constraint for constraint in constraints}
         key = ("graph", self._state, anchor, tuple(sorted(unique)))
         edges, own = self.odometry.edges, list(unique.values())
         return self._remember(

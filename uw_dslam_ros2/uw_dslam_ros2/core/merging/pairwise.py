@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan
-from uw_dslam_ros2.core.merging.settling import Component, Joint
+from uw_dslam_ros2.core.merging.settling import Component, Constraint
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.se2 import SE2
@@ -52,12 +52,12 @@ def make_pairwise_plan(
     idle = [c for c in queue if not library.component_side(c).T_frame_submap]
     queue = [component for component in queue if component not in idle]
     refused: set[frozenset[bytes]] = set()
-    joints: list[Joint] = []
+    constraints: list[Constraint] = []
     num_refused = 0
     while len(queue) > 1 and num_refused < len(queue):
         first, rest = queue[0], queue[1:]
         units = [_unit(library, component, is_growing) for component in (first, *rest)]
-        merged = _merge_first(verifier, first, rest, units, joints, refused)
+        merged = _merge_first(verifier, first, rest, units, constraints, refused)
         if verifier.wanted:
             break
         if merged is None:
@@ -68,7 +68,7 @@ def make_pairwise_plan(
     components = [_anchored(component, anchor) for component in (*queue, *idle)]
     components.sort(key=lambda component: (anchor not in component, min(component)))
     wanted = list(verifier.wanted.values())
-    return Plan(wanted, joints, library.odometry.edges, components)
+    return Plan(wanted, constraints, library.odometry.edges, components)
 
 
 def _vehicle_map(library: Library, vehicle: str) -> Component:
@@ -94,7 +94,7 @@ def _merge_first(
     first: Component,
     rest: Sequence[Component],
     units: Sequence[Unit],
-    joints: list[Joint],
+    constraints: list[Constraint],
     refused: set[frozenset[bytes]],
 ) -> tuple[int, Component] | None:
     """Index of the map that the first one was merged with, and the merged map."""
@@ -109,7 +109,7 @@ def _merge_first(
         refused.add(pair)
         if answer.is_accepted:
             assert answer.T_target_source is not None
-            joints.append(verifier.joint(answer))
+            constraints.append(verifier.constraint(answer))
             T_first_other = (
                 first[target.reference]
                 @ answer.T_target_source

@@ -25,7 +25,7 @@ Ends = tuple[SubmapId, SubmapId]
 _MIN_SHARE = 0.25
 """Least common area of two submaps, as a share of the smaller, that is worth a check."""
 _MIN_VAGUE_SHARE = 0.4
-"""The same for a further joint, which nothing depends on."""
+"""The same for a further constraint, which nothing depends on."""
 
 
 def meetings(

@@ -30,7 +30,7 @@ from uw_dslam_ros2.core.merging.config import VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.library import Library
-from uw_dslam_ros2.core.merging.settling import Component, Joint
+from uw_dslam_ros2.core.merging.settling import Component, Constraint
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.merging.verification import Verifier
@@ -47,7 +47,7 @@ class Plan:
     """Where everything is, as far as is known, and what to ask next."""
 
     wanted: list[Match]
-    joints: list[Joint]
+    constraints: list[Constraint]
     odometry: list[Edge]
     components: list[Component]
     """The anchor's first, then by smallest submap."""
@@ -99,22 +99,22 @@ class _Planner:
         """Work the plan out; the steps of the module's description."""
         ranked = self._ranked(self._units)
         first = most_promising(ranked, self._config.max_partners)
-        joints = self._match_vehicles(first)
+        constraints = self._match_vehicles(first)
         if not self._is_waiting():
-            apart = self._apart(joints, [pair for pair in ranked if pair not in set(first)])
-            joints += self._match_vehicles(apart)
+            apart = self._apart(constraints, [pair for pair in ranked if pair not in set(first)])
+            constraints += self._match_vehicles(apart)
         if not self._is_waiting():
-            joints += self._match_meeting(joints)
+            constraints += self._match_meeting(constraints)
         for _ in range(len(self._units)):
             if self._is_waiting():
                 break
-            more = self._match_components(joints)
+            more = self._match_components(constraints)
             if not more:
                 break
-            joints += more
+            constraints += more
         if not self._is_waiting():
-            joints += self._tighten(joints)
-        return self._finish(joints)
+            constraints += self._tighten(constraints)
+        return self._finish(constraints)
 
     def _is_waiting(self) -> bool:
         return bool(self._verifier.wanted)
@@ -125,43 +125,43 @@ class _Planner:
         pairs = itertools.combinations(sorted(units), 2)
         return sorted(pairs, key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
 
-    def _match_vehicles(self, pairs: Iterable[tuple[str, str]]) -> list[Joint]:
-        joints: list[Joint] = []
+    def _match_vehicles(self, pairs: Iterable[tuple[str, str]]) -> list[Constraint]:
+        constraints: list[Constraint] = []
         for target, source in pairs:
             match = Match(self._units[source], self._units[target])
             sides = self._library.vehicle_side(source), self._library.vehicle_side(target)
-            joints += self._verifier.joints_of(match, *sides)
-        return joints
+            constraints += self._verifier.constraints_of(match, *sides)
+        return constraints
 
     def _apart(
-        self, joints: Sequence[Joint], pairs: Iterable[tuple[str, str]]
+        self, constraints: Sequence[Constraint], pairs: Iterable[tuple[str, str]]
     ) -> list[tuple[str, str]]:
         """Pairs whose vehicles are in different components."""
-        _, components = self._settle(joints)
+        _, components = self._settle(constraints)
         where = component_numbers(components)
         return [(a, b) for a, b in pairs if where[self._unit_id(a)] != where[self._unit_id(b)]]
 
     def _unit_id(self, vehicle: str) -> SubmapId:
         return self._units[vehicle].reference
 
-    def _match_meeting(self, joints: Sequence[Joint]) -> list[Joint]:
+    def _match_meeting(self, constraints: Sequence[Constraint]) -> list[Constraint]:
         """Step 3: a prior from the graph for vehicles without a match of their own."""
-        settled, components = self._settle(joints)
+        settled, components = self._settle(constraints)
         where = component_numbers(components)
         matched = {frozenset((j.edge.source[0], j.edge.target[0])) for j in settled if j.is_inlier}
-        found: list[Joint] = []
+        found: list[Constraint] = []
         for target, source in itertools.combinations(sorted(self._units), 2):
             index = where[self._unit_id(target)]
             if frozenset((source, target)) in matched or index != where[self._unit_id(source)]:
                 continue
             component = components[index]
             sides = [self._library.component_side(component, v) for v in (source, target)]
-            found += self._verifier.joints_nearby(sides[0], sides[1])
+            found += self._verifier.constraints_nearby(sides[0], sides[1])
         return found
 
-    def _match_components(self, joints: Sequence[Joint]) -> list[Joint]:
+    def _match_components(self, constraints: Sequence[Constraint]) -> list[Constraint]:
         """Step 4."""
-        _, components = self._settle(joints)
+        _, components = self._settle(constraints)
         sides = [self._library.component_side(component) for component in components]
         sides = [side for side in sides if side.T_frame_submap]
         candidates: list[tuple[float, Match, Side, Side]] = []
@@ -169,7 +169,7 @@ class _Planner:
             candidates += self._between(source, target)
             candidates += self._between(target, source, is_turned=True)
         candidates.sort(key=lambda c: (-c[0], c[1].key))
-        found: list[Joint] = []
+        found: list[Constraint] = []
         taken: dict[frozenset[SubmapId], int] = {}
         seen = {frozenset((key[0], key[1])) for key in self._verifier.visited}
         for _, match, source_side, target_side in candidates:
@@ -180,20 +180,20 @@ class _Planner:
             ends = frozenset((min(source_side.T_frame_submap), min(target_side.T_frame_submap)))
             taken[ends] = taken.get(ends, 0) + 1
             if taken[ends] <= _MAX_PART_SEARCHES:
-                found += self._verifier.joints_of(match, source_side, target_side)
+                found += self._verifier.constraints_of(match, source_side, target_side)
         return found
 
-    def _tighten(self, joints: Sequence[Joint]) -> list[Joint]:
+    def _tighten(self, constraints: Sequence[Constraint]) -> list[Constraint]:
         """Step 5."""
-        settled, components = self._settle(joints)
-        inliers = [joint for joint in settled if joint.is_inlier]
-        found: list[Joint] = []
+        settled, components = self._settle(constraints)
+        inliers = [constraint for constraint in settled if constraint.is_inlier]
+        found: list[Constraint] = []
         for component in components:
             side = self._library.component_side(component)
             limit = len(
                 side.T_frame_submap
             )  # one for each submap, so that time grows with their number
-            found += self._verifier.joints_where_vague(side, inliers, VAGUE_CELLS, limit)
+            found += self._verifier.constraints_where_vague(side, inliers, VAGUE_CELLS, limit)
         return found
 
     def _between(
@@ -212,41 +212,47 @@ class _Planner:
             found.append((worth, Match(unit, whole), source, target))
         return found
 
-    def _finish(self, joints: list[Joint]) -> Plan:
-        settled, components = self._settle(joints)
+    def _finish(self, constraints: list[Constraint]) -> Plan:
+        settled, components = self._settle(constraints)
         carried = self._carried(settled, components)
         if carried:
-            settled, components = self._settle([*joints, *carried])
+            settled, components = self._settle([*constraints, *carried])
         wanted = sorted(self._verifier.wanted.values(), key=self._is_joined(settled))
         return Plan(wanted, settled, self._library.odometry.edges, components)
 
-    def _carried(self, settled: Sequence[Joint], components: Sequence[Component]) -> list[Joint]:
+    def _carried(
+        self, settled: Sequence[Constraint], components: Sequence[Component]
+    ) -> list[Constraint]:
         """Standing answers that this plan has not asked for, where it has nothing of its own."""
         own = {frozenset((j.edge.source[0], j.edge.target[0])) for j in settled if j.is_inlier}
         where = component_numbers(components)
-        carried: list[Joint] = []
+        carried: list[Constraint] = []
         for key in sorted(self._standing - self._verifier.visited):
             answer = self._answers.get(key)
             if answer is None or not self._library.holds(answer.match):
                 continue
-            joint = self._verifier.joint(answer)
-            ends = joint.edge.source, joint.edge.target
+            constraint = self._verifier.constraint(answer)
+            ends = constraint.edge.source, constraint.edge.target
             is_own = frozenset((ends[0][0], ends[1][0])) in own
             is_apart = where[ends[0]] != where[ends[1]]
             if is_apart or (self._is_waiting() and not is_own):
-                carried.append(joint)
+                carried.append(constraint)
         return carried
 
-    def _is_joined(self, joints: Sequence[Joint]):  # type: ignore[no-untyped-def]
-        joined = {frozenset((j.edge.source[0], j.edge.target[0])) for j in joints if j.is_inlier}
+    def _is_joined(self, constraints: Sequence[Constraint]):  # type: ignore[no-untyped-def]
+        joined = {
+            frozenset((j.edge.source[0], j.edge.target[0])) for j in constraints if j.is_inlier
+        }
 
         def key(match: Match) -> bool:
             return frozenset((match.source.reference[0], match.target.reference[0])) in joined
 
         return key
 
-    def _settle(self, joints: Sequence[Joint]) -> tuple[list[Joint], list[Component]]:
-        return self._library.settle(self._anchor, joints)
+    def _settle(
+        self, constraints: Sequence[Constraint]
+    ) -> tuple[list[Constraint], list[Component]]:
+        return self._library.settle(self._anchor, constraints)
 
 
 def most_promising(ranked: Sequence[tuple[str, str]], max_partners: int) -> list[tuple[str, str]]:

@@ -179,7 +179,7 @@ class MapQueue:
 
     def answers(self) -> list[tuple[Answer, bool]]:
         """All answers, by target and source, and whether each holds in the pose graph."""
-        used = {joint.key for joint in self._plan().joints if joint.is_inlier}
+        used = {constraint.key for constraint in self._plan().constraints if constraint.is_inlier}
         by_question = sorted(
             self._answers.values(),
             key=lambda a: (a.match.target.ids, a.match.source.ids, a.match.key),
@@ -193,7 +193,9 @@ class MapQueue:
     def loops(self) -> list[LoopError]:
         """Cycles of three and more submaps in the graph, and by how much each fails to close."""
         plan = self._plan()
-        return loop_errors(plan.odometry, [joint for joint in plan.joints if joint.is_inlier])
+        return loop_errors(
+            plan.odometry, [constraint for constraint in plan.constraints if constraint.is_inlier]
+        )
 
     def global_map(self) -> OccupancyMap | None:
         """The fused map in frame "map"; None before there is any evidence."""
@@ -296,7 +298,9 @@ class MapQueue:
             else:
                 make = make_growing_plan if self._is_growing else make_plan
                 plan = make(library, self._answers, self._standing, anchor, self._config)
-            self._standing = frozenset(joint.key for joint in plan.joints if joint.is_inlier)
+            self._standing = frozenset(
+                constraint.key for constraint in plan.constraints if constraint.is_inlier
+            )
             self._plan_cache = plan
             if self._pin_for_good(plan):
                 self._plan_cache = None

@@ -59,8 +59,8 @@ def constraints_of(plan: Plan) -> list[Constraint]:
     found: list[Constraint] = []
     edges = [(ConstraintKind.ODOMETRY, edge, True, False) for edge in plan.odometry]
     edges += [
-        (ConstraintKind.REGISTRATION, joint.edge, joint.is_inlier, joint.is_unsure)
-        for joint in plan.joints
+        (ConstraintKind.REGISTRATION, constraint.edge, constraint.is_inlier, constraint.is_unsure)
+        for constraint in plan.constraints
     ]
     for kind, edge, is_inlier, is_unsure in edges:
         is_joined = where[edge.source] == where[edge.target]
@@ -87,13 +87,16 @@ def _merge_reason(submap_id: SubmapId, anchor: SubmapId | None, plan: Plan) -> s
     if submap_id[0] == anchor[0]:
         return "odometry from the submap that pins the global frame"
     own = [
-        joint
-        for joint in plan.joints
-        if joint.is_inlier and submap_id[0] in (joint.edge.source[0], joint.edge.target[0])
+        constraint
+        for constraint in plan.constraints
+        if constraint.is_inlier
+        and submap_id[0] in (constraint.edge.source[0], constraint.edge.target[0])
     ]
-    partners = {i[0] for joint in own for i in (joint.edge.source, joint.edge.target)}
+    partners = {
+        i[0] for constraint in own for i in (constraint.edge.source, constraint.edge.target)
+    }
     reason = f"registered with {', '.join(sorted(partners - {submap_id[0]}))}"
-    if own and all(joint.is_unsure for joint in own):
+    if own and all(constraint.is_unsure for constraint in own):
         reason += ", by several answers that are unsure alone and agree"
     return reason
 

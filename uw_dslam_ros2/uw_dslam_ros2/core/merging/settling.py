@@ -14,14 +14,14 @@ from uw_dslam_ros2.core.pose_graph import solve_graph
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
-__all__ = ["Component", "Joint", "LoopError", "loop_errors", "settle"]
+__all__ = ["Component", "Constraint", "LoopError", "loop_errors", "settle"]
 
 Component = dict[SubmapId, SE2]
 """``T_component_submap``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joint:
+class Constraint:
     """An accepted registration in the graph."""
 
     key: MatchKey
@@ -45,46 +45,48 @@ def settle(
     submaps: Iterable[SubmapId],
     anchor: SubmapId,
     odometry: Sequence[Edge],
-    joints: Sequence[Joint],
+    constraints: Sequence[Constraint],
     inlier_probability: float,
-) -> tuple[list[Joint], list[Component]]:
-    """Solve the graph of each connected group, leaving out the joints that disagree.
+) -> tuple[list[Constraint], list[Component]]:
+    """Solve the graph of each connected group, leaving out the constraints that disagree.
 
     Returns
     -------
     tuple
-        All joints, by key, with what became of them; and the components, the anchor's first (in
-        its frame), then by smallest submap (in that one's frame).
+        All constraints, by key, with what became of them; and the components, the anchor's first
+        (in its frame), then by smallest submap (in that one's frame).
     """
     ids = sorted(submaps)
-    ordered = sorted(joints, key=lambda joint: joint.key)
-    is_inlier = {joint.key: True for joint in ordered}
+    ordered = sorted(constraints, key=lambda constraint: constraint.key)
+    is_inlier = {constraint.key: True for constraint in ordered}
     while True:
-        used = [joint for joint in ordered if is_inlier[joint.key]]
+        used = [constraint for constraint in ordered if is_inlier[constraint.key]]
         components, num_dropped = [], 0
-        for group in _groups(ids, anchor, [*odometry, *(joint.edge for joint in used)]):
+        for group in _groups(ids, anchor, [*odometry, *(constraint.edge for constraint in used)]):
             firm = [edge for edge in odometry if edge.source in group]
-            here = [joint for joint in used if joint.edge.source in group]
+            here = [constraint for constraint in used if constraint.edge.source in group]
             root = anchor if anchor in group else min(group)
             initial = _spread(root, firm, here)
-            edges = [joint.edge for joint in here]
+            edges = [constraint.edge for constraint in here]
             solution = solve_graph(root, firm, edges, initial, inlier_probability)
-            for joint, agrees in zip(here, solution.is_inlier, strict=True):
+            for constraint, agrees in zip(here, solution.is_inlier, strict=True):
                 if not agrees:
-                    is_inlier[joint.key] = False
+                    is_inlier[constraint.key] = False
                     num_dropped += 1
             components.append(solution.T_anchor_pose)
         if num_dropped == 0:
-            settled = [replace(joint, is_inlier=is_inlier[joint.key]) for joint in ordered]
+            settled = [
+                replace(constraint, is_inlier=is_inlier[constraint.key]) for constraint in ordered
+            ]
             return settled, components
 
 
-def loop_errors(odometry: Sequence[Edge], joints: Sequence[Joint]) -> list[LoopError]:
+def loop_errors(odometry: Sequence[Edge], constraints: Sequence[Constraint]) -> list[LoopError]:
     """Cycles of at least three submaps: one for each edge beyond a spanning tree.
 
-    The tree takes odometry first, then the most probable joints.
+    The tree takes odometry first, then the most probable constraints.
     """
-    graph = _joint_graph(odometry, joints)
+    graph = _constraint_graph(odometry, constraints)
     tree = nx.minimum_spanning_tree(graph, weight="cost")
     errors: list[LoopError] = []
     for start, end in sorted(tuple(sorted(ends)) for ends in graph.edges):
@@ -115,23 +117,23 @@ def _groups(
     return sorted(groups, key=lambda group: (anchor not in group, min(group)))
 
 
-def _joint_graph(firm: Sequence[Edge], joints: Sequence[Joint]) -> nx.Graph:
+def _constraint_graph(firm: Sequence[Edge], constraints: Sequence[Constraint]) -> nx.Graph:
     graph = nx.Graph()
     for edge in firm:
         graph.add_edge(edge.source, edge.target, cost=0.0, edge=edge)
-    for joint in joints:
-        ends = joint.edge.source, joint.edge.target
-        cost = 1.0 - joint.probability + 1e-3
+    for constraint in constraints:
+        ends = constraint.edge.source, constraint.edge.target
+        cost = 1.0 - constraint.probability + 1e-3
         if not graph.has_edge(*ends) or graph.edges[ends]["cost"] > cost:
-            graph.add_edge(*ends, cost=cost, edge=joint.edge)
+            graph.add_edge(*ends, cost=cost, edge=constraint.edge)
     return graph
 
 
 def _spread(
-    root: SubmapId, firm: Sequence[Edge], joints: Sequence[Joint]
+    root: SubmapId, firm: Sequence[Edge], constraints: Sequence[Constraint]
 ) -> Mapping[SubmapId, SE2]:
-    """First guess of all poses: along odometry, and over the most probable joints."""
-    graph = _joint_graph(firm, joints)
+    """First guess of all poses: along odometry, and over the most probable constraints."""
+    graph = _constraint_graph(firm, constraints)
     graph.add_node(root)
     tree = nx.minimum_spanning_tree(graph, weight="cost")
     poses = {root: SE2()}

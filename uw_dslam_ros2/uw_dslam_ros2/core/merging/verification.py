@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.merging.answers import Answer, AnswerBook, Match, MatchKey, Use
 from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, MAX_CHECKS, NUM_NEIGHBOURS
 from uw_dslam_ros2.core.merging.consistency import Side
-from uw_dslam_ros2.core.merging.joining import joint_of
+from uw_dslam_ros2.core.merging.constraints import constraint_of
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.places import (
     Ends,
@@ -20,7 +20,7 @@ from uw_dslam_ros2.core.merging.places import (
     sigma_m,
     vague_places,
 )
-from uw_dslam_ros2.core.merging.settling import Joint
+from uw_dslam_ros2.core.merging.settling import Constraint
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.voting import ENOUGH_ODDS, Vote, vote_of, weigh
 from uw_dslam_ros2.core.pose_graph import invert_covariance
@@ -45,7 +45,7 @@ that moves by a little asks no new questions.
 
 
 class Verifier:
-    """Turns questions into joints; collects the questions that are not answered yet."""
+    """Turns questions into constraints; collects the questions that are not answered yet."""
 
     def __init__(
         self,
@@ -59,8 +59,8 @@ class Verifier:
         self.wanted: dict[MatchKey, Match] = {}
         self.visited: set[MatchKey] = set()
 
-    def joints_of(self, match: Match, source: Side, target: Side) -> list[Joint]:
-        """Joints that a match and its checks make; none while an answer is missing.
+    def constraints_of(self, match: Match, source: Side, target: Side) -> list[Constraint]:
+        """Constraints that a match and its checks make; none while an answer is missing.
 
         Parameters
         ----------
@@ -73,7 +73,7 @@ class Verifier:
         if answer is None or answer.use < Use.CLAIM:
             return []
         main = self._vote(answer)
-        edge = main.joint.edge
+        edge = main.constraint.edge
         T_target_source = (
             target.T_frame_submap[edge.target]
             @ edge.T_target_source
@@ -83,7 +83,7 @@ class Verifier:
         if not checks:
             # Two single submaps are all there is to ask about; otherwise they would have met.
             is_single = len(match.source.ids) == len(match.target.ids) == 1
-            return [main.joint] if is_single and answer.is_accepted else []
+            return [main.constraint] if is_single and answer.is_accepted else []
         step = MAX_CHECKS
         for count in range(step, len(checks) + step, step):
             replies = self._ask_all(checks[:count])
@@ -95,25 +95,29 @@ class Verifier:
                 return believed
         return []
 
-    def joints_nearby(self, source: Side, target: Side) -> list[Joint]:
-        """Joints between two vehicles of one component, where the graph says that they meet."""
+    def constraints_nearby(self, source: Side, target: Side) -> list[Constraint]:
+        """Constraints between two vehicles of one component, where the graph lets them meet."""
         checks = self._checks(None, None, SE2(), source, target)[:MAX_CHECKS]
         replies = self._ask_all(checks)
         if replies is None:
             return []
         return self._weigh(self._votes(replies), len(replies), source, target)[0]
 
-    def joints_where_vague(
+    def constraints_where_vague(
         self,
         side: Side,
-        joints: Sequence[Joint],
+        constraints: Sequence[Constraint],
         vague_cells: float,
         limit: int,
         chosen: Container[SubmapId] | None = None,
-    ) -> list[Joint]:
-        """Further joints inside one component, where they would tell most; see `vague_places`."""
-        inside = [joint for joint in joints if joint.edge.source in side.T_frame_submap]
-        edges = [joint.edge for joint in inside]
+    ) -> list[Constraint]:
+        """Further constraints inside one component, where they tell most; see `vague_places`."""
+        inside = [
+            constraint
+            for constraint in constraints
+            if constraint.edge.source in side.T_frame_submap
+        ]
+        edges = [constraint.edge for constraint in inside]
         places = vague_places(
             self._library, side, edges, NUM_NEIGHBOURS, vague_cells, limit, chosen
         )
@@ -121,25 +125,25 @@ class Verifier:
         for ends, uncertainty in places:
             check = self._check(ends, side.between(ends[1], ends[0]), uncertainty)
             groups.setdefault(frozenset((ends[0][0], ends[1][0])), []).append(check)
-        found: list[Joint] = []
+        found: list[Constraint] = []
         for vehicles, checks in sorted(groups.items(), key=lambda item: sorted(item[0])):
             replies = self._ask_all(checks)
             if replies is None:
                 continue
             new = self._votes(replies)
             old = [
-                Vote(joint, None, is_accepted=True)
-                for joint in inside
-                if {joint.edge.source[0], joint.edge.target[0]} == vehicles
+                Vote(constraint, None, is_accepted=True)
+                for constraint in inside
+                if {constraint.edge.source[0], constraint.edge.target[0]} == vehicles
             ]
-            keys = {vote.joint.key for vote in new}
+            keys = {vote.constraint.key for vote in new}
             believed, _ = self._weigh([*old, *new], len(replies), side, side)
-            found += [joint for joint in believed if joint.key in keys]
+            found += [constraint for constraint in believed if constraint.key in keys]
         return found
 
-    def joint(self, answer: Answer) -> Joint:
-        """The edge of an answer; see `joint_of`."""
-        return joint_of(self._library, answer)
+    def constraint(self, answer: Answer) -> Constraint:
+        """The edge of an answer; see `constraint_of`."""
+        return constraint_of(self._library, answer)
 
     def ask(self, match: Match) -> Answer | None:
         """The answer, if there is one; otherwise the question is noted as wanted."""
@@ -200,14 +204,14 @@ class Verifier:
         return Match(source, target, _prior_around(T_target_source, half_m, half_rad))
 
     def _vote(self, answer: Answer) -> Vote:
-        return vote_of(self.joint(answer), answer)
+        return vote_of(self.constraint(answer), answer)
 
     def _votes(self, replies: Sequence[Answer]) -> list[Vote]:
         return [self._vote(reply) for reply in replies if reply.use >= Use.VOTE]
 
     def _weigh(
         self, votes: Sequence[Vote], num_checks: int, source: Side, target: Side
-    ) -> tuple[list[Joint], float]:
+    ) -> tuple[list[Constraint], float]:
         return weigh(votes, num_checks, source, target, INLIER_PROBABILITY)
 
     def _ask_all(self, matches: Sequence[Match]) -> list[Answer] | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.merging.consistency import Side, consistent_set, cycle_of
-from uw_dslam_ros2.core.merging.settling import Joint
+from uw_dslam_ros2.core.merging.settling import Constraint
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.pose_graph import chi2_threshold
 from uw_dslam_ros2.core.registration.result import PriorWindow
@@ -31,14 +31,14 @@ _LEAST_CHANCE = 0.05
 class Vote:
     """An answer as evidence; without a prior it is the claim that the others check."""
 
-    joint: Joint
+    constraint: Constraint
     prior: PriorWindow | None
     is_accepted: bool
 
 
-def vote_of(joint: Joint, answer: Answer) -> Vote:
+def vote_of(constraint: Constraint, answer: Answer) -> Vote:
     """An answer, with the edge that it would make, as a vote."""
-    return Vote(joint, answer.match.prior, answer.is_accepted)
+    return Vote(constraint, answer.match.prior, answer.is_accepted)
 
 
 def weigh(
@@ -47,8 +47,8 @@ def weigh(
     source: Side,
     target: Side,
     inlier_probability: float,
-) -> tuple[list[Joint], float]:
-    """The joints to be believed, and the odds that what they say is true.
+) -> tuple[list[Constraint], float]:
+    """The constraints to be believed, and the odds that what they say is true.
 
     Every check that agrees with another vote speaks for it as much as such an agreement is
     unlikely by chance: the smaller the region of agreement is within the window that was searched,
@@ -66,11 +66,11 @@ def weigh(
     inlier_probability
         Share of true pairs that the chi-square test lets pass.
     """
-    edges = [_turned(vote.joint.edge, source, target) for vote in votes]
-    weights = [vote.joint.probability for vote in votes]
+    edges = [_turned(vote.constraint.edge, source, target) for vote in votes]
+    weights = [vote.constraint.probability for vote in votes]
     clique = consistent_set(edges, weights, source, target, inlier_probability)
     has_accepted = any(votes[index].is_accepted for index in clique)
-    believed: list[Joint] = []
+    believed: list[Constraint] = []
     odds = (1.0 - _PASS) ** (num_checks - sum(votes[i].prior is not None for i in clique))
     for place, index in enumerate(clique):
         vote = votes[index]
@@ -79,9 +79,9 @@ def weigh(
             for other in clique
             if other != index
         }
-        lacking = 1.0 / max(vote.joint.probability, 1e-9) - 1.0
+        lacking = 1.0 / max(vote.constraint.probability, 1e-9) - 1.0
         if vote.is_accepted or lacking * min(chances.values(), default=1.0) <= 1.0 / ENOUGH_ODDS:
-            believed.append(vote.joint)
+            believed.append(vote.constraint)
         if place > 0 and vote.prior is not None:
             odds *= _PASS / min(chances[earlier] for earlier in clique[:place])
     # Without an accepted answer among them, agreement has to be beyond doubt.

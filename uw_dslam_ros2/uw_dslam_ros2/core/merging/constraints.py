@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.merging.library import Library
-from uw_dslam_ros2.core.merging.settling import Joint
+from uw_dslam_ros2.core.merging.settling import Constraint
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.pose_graph import compose_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
-__all__ = ["joint_of"]
+__all__ = ["constraint_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ residual shows.
 """
 
 
-def joint_of(library: Library, answer: Answer) -> Joint:
+def constraint_of(library: Library, answer: Answer) -> Constraint:
     """The edge of an answer, between the two submaps that share most.
 
     Parameters
@@ -47,7 +47,7 @@ def joint_of(library: Library, answer: Answer) -> Joint:
     )
     covariance = edge.covariance + _distrust(library, source, target, edge)
     edge = Edge(edge.source, edge.target, edge.T_target_source, covariance)
-    return Joint(answer.match.key, edge, answer.probability, is_unsure=not answer.is_accepted)
+    return Constraint(answer.match.key, edge, answer.probability, is_unsure=not answer.is_accepted)
 
 
 def _ends(
