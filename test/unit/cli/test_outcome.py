@@ -66,7 +66,7 @@ def test_the_numbers_of_an_answer_are_listed_and_survive_a_session(tmp_path: Pat
 def test_a_refusal_without_a_pose_is_listed_without_numbers(tmp_path: Path) -> None:
     queue = missions.settled_queue()
     few = RegistrationResult.refused(Verdict.TOO_FEW_FEATURES, "few")
-    answers = [Answer.of(answer.match, few) for answer, _ in queue.answers()]
+    answers = [Answer.of(answer.query, few) for answer, _ in queue.answers()]
     outcome = replace(
         outcome_of(queue),
         registrations=tuple(RegistrationRow.of(k, a, False) for k, a in enumerate(answers)),

@@ -83,7 +83,7 @@ def test_saving_again_writes_only_what_is_new(tmp_path):
 def contents(queue: MapQueue):
     state = queue.to_state()
     submaps = [(submap.submap_id, submap.grid.values.tobytes()) for submap in state.submaps]
-    return submaps, state.withdrawn, [answer.match.key for answer in state.answers]
+    return submaps, state.withdrawn, [answer.query.key for answer in state.answers]
 
 
 class InterruptedWriteError(Exception):

@@ -8,21 +8,21 @@ import pytest
 from unit.merging.fleet import three_vehicles
 
 from uw_dslam_ros2.core.merging import MapQueue
-from uw_dslam_ros2.core.merging.answers import Answer, Match, Use
-from uw_dslam_ros2.core.merging.units import Unit
+from uw_dslam_ros2.core.merging.answers import Answer, Query, Use
+from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.session import load_session, save_session
 from uw_dslam_ros2.sim.fleets import make_result
 
-SIDES = [Unit((name, 0), {(name, 0): SE2()}, name.encode()) for name in ("auv_1", "auv_2")]
-EVERYWHERE = Match(*SIDES)
-NEAR = Match(*SIDES, PriorWindow(SE2(1.0, 2.0, 0.5), 1.0, 0.2))
+SIDES = [SubmapGroup((name, 0), {(name, 0): SE2()}, name.encode()) for name in ("auv_1", "auv_2")]
+EVERYWHERE = Query(*SIDES)
+NEAR = Query(*SIDES, PriorWindow(SE2(1.0, 2.0, 0.5), 1.0, 0.2))
 FOUND = replace(make_result(SE2(1.0, 2.0, 0.5)), reason="because")
 
 
-def answer(match=EVERYWHERE, **changes):
-    return Answer.of(match, replace(FOUND, **changes))
+def answer(query=EVERYWHERE, **changes):
+    return Answer.of(query, replace(FOUND, **changes))
 
 
 @pytest.mark.parametrize(
@@ -39,9 +39,9 @@ def answer(match=EVERYWHERE, **changes):
         (Verdict.TOO_FEW_FEATURES, 0.9, Use.NOTHING),
     ],
 )
-@pytest.mark.parametrize("match", [EVERYWHERE, NEAR], ids=["everywhere", "near"])
-def test_the_verdict_says_what_an_answer_is_good_for(verdict, probability, use, match):
-    given = answer(match, verdict=verdict, probability=probability)
+@pytest.mark.parametrize("query", [EVERYWHERE, NEAR], ids=["everywhere", "near"])
+def test_the_verdict_says_what_an_answer_is_good_for(verdict, probability, use, query):
+    given = answer(query, verdict=verdict, probability=probability)
     assert given.use is use
     assert given.is_accepted is (verdict is Verdict.ACCEPTED)
     assert given.why == "because"
@@ -72,8 +72,8 @@ def test_an_answer_that_is_not_finite_is_of_no_use(verdict, name, bad):
 
 def test_an_answer_without_a_pose_is_of_no_use():
     refused = RegistrationResult.refused(Verdict.IMPROBABLE, "because")
-    for match in (EVERYWHERE, NEAR):
-        assert Answer.of(match, refused).use is Use.NOTHING
+    for query in (EVERYWHERE, NEAR):
+        assert Answer.of(query, refused).use is Use.NOTHING
 
 
 def test_refusals_survive_a_session(tmp_path):
@@ -88,7 +88,7 @@ def test_refusals_survive_a_session(tmp_path):
         queue.add_result(request.request_id, result)
     save_session(tmp_path, queue)
     before, after = (
-        {a.match.key: a for a, _ in q.answers()} for q in (queue, load_session(tmp_path))
+        {a.query.key: a for a, _ in q.answers()} for q in (queue, load_session(tmp_path))
     )
     assert len(before) == 2
     assert set(before) == set(after)

@@ -11,7 +11,7 @@ from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, SubmapState
-from uw_dslam_ros2.core.merging.settling import Constraint, loop_errors
+from uw_dslam_ros2.core.merging.components import Constraint, loop_errors
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
@@ -389,7 +389,7 @@ def test_only_edges_of_refused_answers_are_marked_unsure():
     queue = filled()
     answer_all(queue, half_sure)
     refused = {
-        frozenset((answer.match.source.reference[0], answer.match.target.reference[0]))
+        frozenset((answer.query.source.reference[0], answer.query.target.reference[0]))
         for answer, is_used in queue.answers()
         if is_used and not answer.is_accepted
     }

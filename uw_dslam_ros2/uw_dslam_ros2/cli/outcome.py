@@ -78,8 +78,8 @@ class RegistrationRow:
         lower = numbers.get("lower_bound", math.nan)
         return cls(
             number,
-            names_of(answer.match.source.ids),
-            names_of(answer.match.target.ids),
+            names_of(answer.query.source.ids),
+            names_of(answer.query.target.ids),
             answer.verdict.name,
             answer.why,
             is_used,
@@ -101,7 +101,7 @@ class RegistrationRow:
             numbers.get("inlier_ratio", math.nan),
             int(numbers.get("num_source_points", 0)),
             int(numbers.get("num_target_points", 0)),
-            answer.match.prior is not None,
+            answer.query.prior is not None,
         )
 
 

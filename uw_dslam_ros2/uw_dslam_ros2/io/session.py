@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, QueueState
-from uw_dslam_ros2.core.merging.answers import Answer, Match
-from uw_dslam_ros2.core.merging.units import Unit
+from uw_dslam_ros2.core.merging.answers import Answer, Query
+from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
@@ -281,16 +281,16 @@ def _spec_from_plain(values: list[Any]) -> GridSpec:
 
 
 def _answer_digest(answer: Answer) -> bytes:
-    source, target, prior = answer.match.key
+    source, target, prior = answer.query.key
     text = repr(prior).encode() + repr(_answer_to_plain(answer)).encode()
     return hashlib.blake2b(source + target + text, digest_size=16).digest()
 
 
 def _answer_to_plain(answer: Answer) -> dict[str, Any]:
-    prior, motion = answer.match.prior, answer.T_target_source
+    prior, motion = answer.query.prior, answer.T_target_source
     return {
-        "source": _unit_to_plain(answer.match.source),
-        "target": _unit_to_plain(answer.match.target),
+        "source": _group_to_plain(answer.query.source),
+        "target": _group_to_plain(answer.query.target),
         "prior": prior
         and [
             prior.T_target_source.as_array().tolist(),
@@ -308,13 +308,13 @@ def _answer_to_plain(answer: Answer) -> dict[str, Any]:
 
 def _answer_from_plain(plain: dict[str, Any]) -> Answer:
     prior, motion = plain["prior"], plain["T_target_source"]
-    match = Match(
-        _unit_from_plain(plain["source"]),
-        _unit_from_plain(plain["target"]),
+    query = Query(
+        _group_from_plain(plain["source"]),
+        _group_from_plain(plain["target"]),
         None if prior is None else PriorWindow(SE2(*prior[0]), prior[1], prior[2]),
     )
     return Answer(
-        match,
+        query,
         Verdict(plain["verdict"]),
         plain["reason"],
         None if motion is None else SE2(*motion),
@@ -324,14 +324,14 @@ def _answer_from_plain(plain: dict[str, Any]) -> Answer:
     )
 
 
-def _unit_to_plain(unit: Unit) -> dict[str, Any]:
-    members = [[*i, *T.as_array().tolist()] for i, T in unit.T_reference_submap.items()]
-    return {"reference": unit.reference, "members": members, "key": unit.key.hex()}
+def _group_to_plain(group: SubmapGroup) -> dict[str, Any]:
+    members = [[*i, *T.as_array().tolist()] for i, T in group.T_reference_submap.items()]
+    return {"reference": group.reference, "members": members, "key": group.key.hex()}
 
 
-def _unit_from_plain(plain: dict[str, Any]) -> Unit:
+def _group_from_plain(plain: dict[str, Any]) -> SubmapGroup:
     members: dict[SubmapId, SE2] = {}
     for vehicle, sequence, x, y, yaw in plain["members"]:
         members[vehicle, sequence] = SE2(x, y, yaw)
     vehicle, sequence = plain["reference"]
-    return Unit((vehicle, sequence), members, bytes.fromhex(plain["key"]))
+    return SubmapGroup((vehicle, sequence), members, bytes.fromhex(plain["key"]))

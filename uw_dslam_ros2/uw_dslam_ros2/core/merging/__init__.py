@@ -1,8 +1,8 @@
 """Many submaps of many vehicles, in any order, into one map."""
 
+from uw_dslam_ros2.core.merging.components import LoopError
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.queue import MapQueue
-from uw_dslam_ros2.core.merging.settling import LoopError
 from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
     Constraint,

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.merging.units import Unit
+from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.registration.rules import Rule, first_that_applies
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
-__all__ = ["Answer", "AnswerBook", "Match", "MatchKey", "Use"]
+__all__ = ["Answer", "AnswerBook", "Query", "QueryKey", "Use"]
 
 FloatArray = NDArray[np.float64]
 
@@ -23,20 +23,20 @@ FloatArray = NDArray[np.float64]
 _UNSURE = Verdict.NOT_ENOUGH_OVERLAP, Verdict.IMPROBABLE
 _WORTH_ASKING = 0.5  # probability from which an unsure pose is
 
-MatchKey = tuple[bytes, bytes, tuple[float, ...]]
-"""Source unit, target unit, prior: equal keys are the same question and get the same answer."""
+QueryKey = tuple[bytes, bytes, tuple[float, ...]]
+"""Source group, target group, prior: equal keys are the same question and get the same answer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Match:
+class Query:
     """A question: where the source lies in the target."""
 
-    source: Unit
-    target: Unit
+    source: SubmapGroup
+    target: SubmapGroup
     prior: PriorWindow | None = None
 
     @property
-    def key(self) -> MatchKey:
+    def key(self) -> QueryKey:
         """What makes two questions the same."""
         return self.source.key, self.target.key, _prior_key(self.prior)
 
@@ -60,7 +60,7 @@ class Answer:
     ``why`` is the reason for that: the result's own, or what the queue has against it.
     """
 
-    match: Match
+    query: Query
     verdict: Verdict
     reason: str
     T_target_source: SE2 | None  # None where no pose was judged
@@ -76,10 +76,10 @@ class Answer:
         object.__setattr__(self, "why", rule.sentence(self))
 
     @classmethod
-    def of(cls, match: Match, result: RegistrationResult) -> Answer:
+    def of(cls, query: Query, result: RegistrationResult) -> Answer:
         """What to keep of a result."""
         return cls(
-            match,
+            query,
             result.verdict,
             result.reason,
             result.T_target_source,
@@ -100,7 +100,7 @@ class Answer:
 
     def is_about(self, prior: PriorWindow) -> bool:
         """Whether nearly this window was searched: the middle of each lies well in the other."""
-        own = self.match.prior
+        own = self.query.prior
         if own is None:
             return False
         one, other = own.T_target_source, prior.T_target_source
@@ -128,7 +128,7 @@ class Answer:
 _RULES: tuple[Rule[Answer, Use], ...] = (
     Rule(lambda a: a.T_target_source is None, Use.NOTHING, lambda a: a.reason),
     Rule(
-        lambda a: not a.is_inside(a.match.prior),
+        lambda a: not a.is_inside(a.query.prior),
         Use.NOTHING,
         lambda a: f"{a.reason}; but the pose is outside the window that was asked for",
     ),
@@ -167,39 +167,39 @@ class AnswerBook:
         but then it counts what was asked before.
     """
 
-    def __init__(self, answers: Mapping[MatchKey, Answer], *, is_lenient: bool) -> None:
+    def __init__(self, answers: Mapping[QueryKey, Answer], *, is_lenient: bool) -> None:
         self._answers, self._is_lenient = answers, is_lenient
         self._seen: dict[object, list[Answer]] = {}
         if is_lenient:
             for answer in answers.values():
                 self._note(answer)
 
-    def find(self, match: Match) -> Answer | None:
+    def find(self, query: Query) -> Answer | None:
         """The answer to exactly this question."""
-        answer = self._answers.get(match.key)
+        answer = self._answers.get(query.key)
         if answer is not None and not self._is_lenient:
             self._note(answer)
         return answer
 
-    def find_similar(self, match: Match) -> Answer | None:
+    def find_similar(self, query: Query) -> Answer | None:
         """An answer that serves as well; of the questions that were found before, or of all."""
-        if match.prior is None:
+        if query.prior is None:
             return None
-        for earlier in self._seen.get(self._maps_of(match), ()):
-            if earlier.use >= Use.VOTE and earlier.is_inside(match.prior):
+        for earlier in self._seen.get(self._maps_of(query), ()):
+            if earlier.use >= Use.VOTE and earlier.is_inside(query.prior):
                 return earlier
-            if self._is_lenient and earlier.is_about(match.prior):
+            if self._is_lenient and earlier.is_about(query.prior):
                 return earlier
         return None
 
     def _note(self, answer: Answer) -> None:
-        if answer.match.prior is not None:
-            self._seen.setdefault(self._maps_of(answer.match), []).append(answer)
+        if answer.query.prior is not None:
+            self._seen.setdefault(self._maps_of(answer.query), []).append(answer)
 
-    def _maps_of(self, match: Match) -> object:
+    def _maps_of(self, query: Query) -> object:
         if self._is_lenient:
-            return match.source.ids, match.target.ids
-        return match.source.key, match.target.key
+            return query.source.ids, query.target.ids
+        return query.source.key, query.target.key
 
 
 _NUMBERS = (

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.components import Constraint
 from uw_dslam_ros2.core.merging.library import Library
-from uw_dslam_ros2.core.merging.settling import Constraint
+from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.merging.types import Edge
-from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.pose_graph import compose_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
@@ -34,7 +34,7 @@ def constraint_of(library: Library, answer: Answer) -> Constraint:
     answer
         With a transform that means something.
     """
-    source, target = answer.match.source, answer.match.target
+    source, target = answer.query.source, answer.query.target
     T_target_source = answer.T_target_source
     assert T_target_source is not None
     ends = _ends(library, source, target, T_target_source)
@@ -47,11 +47,11 @@ def constraint_of(library: Library, answer: Answer) -> Constraint:
     )
     covariance = edge.covariance + _distrust(library, source, target, edge)
     edge = Edge(edge.source, edge.target, edge.T_target_source, covariance)
-    return Constraint(answer.match.key, edge, answer.probability, is_unsure=not answer.is_accepted)
+    return Constraint(answer.query.key, edge, answer.probability, is_unsure=not answer.is_accepted)
 
 
 def _ends(
-    library: Library, source: Unit, target: Unit, T_target_source: SE2
+    library: Library, source: SubmapGroup, target: SubmapGroup, T_target_source: SE2
 ) -> tuple[SubmapId, SubmapId]:
     best = (-1.0, source.reference, target.reference)
     for source_id, T_source in source.T_reference_submap.items():
@@ -64,7 +64,9 @@ def _ends(
     return best[1], best[2]
 
 
-def _distrust(library: Library, source: Unit, target: Unit, edge: Edge) -> FloatArray:
+def _distrust(
+    library: Library, source: SubmapGroup, target: SubmapGroup, edge: Edge
+) -> FloatArray:
     """Covariance (3, 3) that a registration cannot know of: the cells, and bent maps."""
     cell_m = _EDGE_SIGMA_CELLS * library.submaps[edge.target].submap.grid.spec.resolution_m
     radius_m = min(library.submaps[i].radius_m for i in (edge.source, edge.target))

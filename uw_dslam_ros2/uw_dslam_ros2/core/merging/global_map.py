@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import MapProvenance
-from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.mosaic import Mosaic, Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId

@@ -22,12 +22,12 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
-from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey, Use
+from uw_dslam_ros2.core.merging.answers import Answer, Query, QueryKey, Use
+from uw_dslam_ros2.core.merging.components import Component, Constraint
 from uw_dslam_ros2.core.merging.config import NUM_NEIGHBOURS, VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers, most_promising
-from uw_dslam_ros2.core.merging.settling import Component, Constraint
 from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.submap import SubmapId
 
@@ -38,8 +38,8 @@ Pair = tuple[str, str]
 
 def make_growing_plan(
     library: Library,
-    answers: Mapping[MatchKey, Answer],
-    standing: AbstractSet[MatchKey],
+    answers: Mapping[QueryKey, Answer],
+    standing: AbstractSet[QueryKey],
     anchor: SubmapId,
     config: MapQueueConfig,
 ) -> Plan:
@@ -53,8 +53,8 @@ class _GrowingPlanner:
     def __init__(
         self,
         library: Library,
-        answers: Mapping[MatchKey, Answer],
-        standing: AbstractSet[MatchKey],
+        answers: Mapping[QueryKey, Answer],
+        standing: AbstractSet[QueryKey],
         anchor: SubmapId,
         config: MapQueueConfig,
     ) -> None:
@@ -63,29 +63,29 @@ class _GrowingPlanner:
         self._standing = [
             answers[key]
             for key in sorted(standing)
-            if key in answers and library.holds(answers[key].match)
+            if key in answers and library.holds(answers[key].query)
         ]
         self._claims = _claims(library, answers.values())
 
     def run(self) -> Plan:
         """Work the plan out; the steps of the module's description."""
         constraints = [self._verifier.constraint(answer) for answer in self._standing]
-        settled, components = self._settle(constraints)
+        solved, components = self._solve(constraints)
         for pair in self._apart(components):
             constraints += self._check_claims(pair)
-        settled, components = self._settle(constraints)
+        solved, components = self._solve(constraints)
         if not self._verifier.wanted:
             self._ask_best(self._apart(components))
         for component in components:
-            constraints += self._tie_newest(component, settled)
-        settled, components = self._settle(constraints)
+            constraints += self._tie_newest(component, solved)
+        solved, components = self._solve(constraints)
         wanted = list(self._verifier.wanted.values())
-        return Plan(wanted, settled, self._library.odometry.edges, components)
+        return Plan(wanted, solved, self._library.odometry.edges, components)
 
-    def _settle(
+    def _solve(
         self, constraints: Sequence[Constraint]
     ) -> tuple[list[Constraint], list[Component]]:
-        return self._library.settle(self._anchor, constraints)
+        return self._library.solve(self._anchor, constraints)
 
     def _apart(self, components: Sequence[Component]) -> list[Pair]:
         """The best pairs of vehicles of different components, the most promising first."""
@@ -108,10 +108,10 @@ class _GrowingPlanner:
             if answer.use < Use.CLAIM:
                 continue
             sides = [
-                self._library.side_of(unit.ids)
-                for unit in (answer.match.source, answer.match.target)
+                self._library.side_of(group.ids)
+                for group in (answer.query.source, answer.query.target)
             ]
-            constraints = self._verifier.constraints_of(answer.match, sides[0], sides[1])
+            constraints = self._verifier.constraints_of(answer.query, sides[0], sides[1])
             if constraints or self._verifier.wanted:
                 return constraints
         return []
@@ -120,8 +120,8 @@ class _GrowingPlanner:
         busy: set[str] = set()
         for target, source in pairs:
             if busy.isdisjoint((target, source)) and self._has_grown((target, source)):
-                units = self._library.closed_unit(source), self._library.closed_unit(target)
-                self._verifier.ask(Match(*units))
+                groups = self._library.closed_group(source), self._library.closed_group(target)
+                self._verifier.ask(Query(*groups))
                 busy |= {target, source}
 
     def _has_grown(self, pair: Pair) -> bool:
@@ -149,17 +149,17 @@ def _claims(library: Library, answers: Iterable[Answer]) -> dict[Pair, list[Answ
     """Answers to questions without a guess, of one vehicle's map in another's; largest first."""
     found: dict[Pair, list[Answer]] = {}
     for answer in answers:
-        match = answer.match
-        source = {submap_id[0] for submap_id in match.source.ids}
-        target = {submap_id[0] for submap_id in match.target.ids}
-        is_pair = match.prior is None and len(source) == len(target) == 1 and source != target
-        if is_pair and library.holds(match):
+        query = answer.query
+        source = {submap_id[0] for submap_id in query.source.ids}
+        target = {submap_id[0] for submap_id in query.target.ids}
+        is_pair = query.prior is None and len(source) == len(target) == 1 and source != target
+        if is_pair and library.holds(query):
             first, second = sorted(source | target)
             found.setdefault((first, second), []).append(answer)
     for claims in found.values():
-        claims.sort(key=lambda answer: (-_size(answer), answer.match.key))
+        claims.sort(key=lambda answer: (-_size(answer), answer.query.key))
     return found
 
 
 def _size(answer: Answer) -> int:
-    return len(answer.match.source.ids) * len(answer.match.target.ids)
+    return len(answer.query.source.ids) * len(answer.query.target.ids)

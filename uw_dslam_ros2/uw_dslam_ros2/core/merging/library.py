@@ -10,13 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.merging.answers import Match
+from uw_dslam_ros2.core.merging.answers import Query
+from uw_dslam_ros2.core.merging.components import Component, Constraint, solve_components
 from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, LOG_ODDS_MAX, NUM_NEIGHBOURS
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.descriptors import MapShape, shape_of
 from uw_dslam_ros2.core.merging.odometry import Odometry
-from uw_dslam_ros2.core.merging.settling import Component, Constraint, settle
-from uw_dslam_ros2.core.merging.units import StoredSubmap, Unit, render_unit, shared_area_m2
+from uw_dslam_ros2.core.merging.submap_groups import (
+    StoredSubmap,
+    SubmapGroup,
+    render_group,
+    shared_area_m2,
+)
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
@@ -44,7 +49,7 @@ def milestone(count: int) -> int:
 
 
 class Library:
-    """Units and sides of one state of the submaps.
+    """Groups and sides of one state of the submaps.
 
     Parameters
     ----------
@@ -78,13 +83,13 @@ class Library:
             for i, s in sorted(submaps.items())
         )
 
-    def whole_units(self) -> dict[str, Unit]:
+    def whole_groups(self) -> dict[str, SubmapGroup]:
         """Each vehicle's map up to its last milestone, of closed submaps where there are any."""
-        units = {}
+        groups = {}
         for vehicle in self._by_vehicle:
             ids = self.closed(vehicle)
-            units[vehicle] = self._odometry_unit(ids[: milestone(len(ids))])
-        return units
+            groups[vehicle] = self._odometry_group(ids[: milestone(len(ids))])
+        return groups
 
     @property
     def vehicles(self) -> list[str]:
@@ -96,36 +101,36 @@ class Library:
         ids = self._by_vehicle[vehicle]
         return [i for i in ids if self.active[i].submap.is_final] or ids
 
-    def closed_unit(self, vehicle: str) -> Unit:
+    def closed_group(self, vehicle: str) -> SubmapGroup:
         """All of a vehicle's closed submaps."""
-        return self._odometry_unit(self.closed(vehicle))
+        return self._odometry_group(self.closed(vehicle))
 
-    def window(self, submap_id: SubmapId) -> Unit:
+    def window(self, submap_id: SubmapId) -> SubmapGroup:
         """A submap with its neighbours in its vehicle's sequence."""
         ids = self.closed(submap_id[0])
         index = ids.index(submap_id)
         reach = NUM_NEIGHBOURS if len(ids) > 2 * NUM_NEIGHBOURS + 1 else 0
         low, high = max(0, index - reach), index + reach + 1
-        return self._odometry_unit(ids[low:high], submap_id)
+        return self._odometry_group(ids[low:high], submap_id)
 
-    def parts(self, side: Side) -> list[Unit]:
+    def parts(self, side: Side) -> list[SubmapGroup]:
         """Stretches of each vehicle in a side, overlapping by half; never all of a vehicle."""
-        units: list[Unit] = []
+        groups: list[SubmapGroup] = []
         for vehicle in sorted({submap_id[0] for submap_id in side.T_frame_submap}):
             ids = self.closed(vehicle)
             length = min(_PART_LENGTH, -(-len(ids) // 2))
             stride = max(1, length // 2)
             last = len(ids) - length
             for start in sorted({*range(0, last, stride), last}):
-                units.append(self._odometry_unit(ids[start : start + length]))
-        return units
+                groups.append(self._odometry_group(ids[start : start + length]))
+        return groups
 
-    def component_unit(self, side: Side) -> Unit:
+    def component_group(self, side: Side) -> SubmapGroup:
         """Everything in a side as one map."""
         ids = sorted(side.T_frame_submap)
         members = [self.active[i] for i in ids]
         poses = [side.T_frame_submap[i] for i in ids]
-        return Unit.of(members, poses, len(ids) // 2)
+        return SubmapGroup.of(members, poses, len(ids) // 2)
 
     def vehicle_side(self, vehicle: str) -> Side:
         """A vehicle's closed submaps, placed by its own odometry."""
@@ -153,25 +158,25 @@ class Library:
 
         return Side(poses, covariance)
 
-    def holds(self, match: Match) -> bool:
+    def holds(self, query: Query) -> bool:
         """Whether all submaps of a question are still in use."""
-        return all(i in self.active for i in (*match.source.ids, *match.target.ids))
+        return all(i in self.active for i in (*query.source.ids, *query.target.ids))
 
-    def render(self, unit: Unit) -> OccupancyMap:
-        """The unit's map; not remembered, for its size."""
-        occupancy = render_unit(unit, self.submaps, LOG_ODDS_MAX)
+    def render(self, group: SubmapGroup) -> OccupancyMap:
+        """The group's map; not remembered, for its size."""
+        occupancy = render_group(group, self.submaps, LOG_ODDS_MAX)
         assert occupancy is not None, "active submaps hold something"
         return occupancy
 
-    def shape(self, unit: Unit) -> MapShape:
-        """Descriptor of the unit's map."""
-        return self._remember(("shape", unit.key), lambda: shape_of(self.render(unit)))
+    def shape(self, group: SubmapGroup) -> MapShape:
+        """Descriptor of the group's map."""
+        return self._remember(("shape", group.key), lambda: shape_of(self.render(group)))
 
     def rough_shape(self, vehicle: str) -> MapShape:
         """Descriptor of a vehicle's map, as it was at its last milestone."""
         ids = self.closed(vehicle)[: milestone(len(self.closed(vehicle)))]
         key = ("rough", tuple((i, self.active[i].digest) for i in ids))
-        return self._remember(key, lambda: shape_of(self.render(self._odometry_unit(ids))))
+        return self._remember(key, lambda: shape_of(self.render(self._odometry_group(ids))))
 
     def shared_area_m2(self, source: SubmapId, target: SubmapId, T_target_source: SE2) -> float:
         """Area that two submaps have both seen."""
@@ -181,22 +186,24 @@ class Library:
         key = ("area", first.digest, second.digest, T_target_source)
         return self._remember(key, lambda: shared_area_m2(first, second, T_target_source))
 
-    def settle(
+    def solve(
         self, anchor: SubmapId, constraints: Sequence[Constraint]
     ) -> tuple[list[Constraint], list[Component]]:
-        """Solve the pose graph; see `settling.settle`."""
+        """Solve the pose graph; see `components.solve_components`."""
         # One answer may serve several matches; it is one edge.
         unique = {constraint.key: constraint for constraint in constraints}
         key = ("graph", self._state, anchor, tuple(sorted(unique)))
         edges, own = self.odometry.edges, list(unique.values())
         return self._remember(
-            key, lambda: settle(self.submaps, anchor, edges, own, INLIER_PROBABILITY)
+            key, lambda: solve_components(self.submaps, anchor, edges, own, INLIER_PROBABILITY)
         )
 
-    def _odometry_unit(self, ids: Sequence[SubmapId], reference: SubmapId | None = None) -> Unit:
+    def _odometry_group(
+        self, ids: Sequence[SubmapId], reference: SubmapId | None = None
+    ) -> SubmapGroup:
         members = [self.active[i] for i in ids]
         poses = [self.odometry.T_odom_submap(i) for i in ids]
-        return Unit.of(members, poses, ids.index(reference) if reference else len(ids) // 2)
+        return SubmapGroup.of(members, poses, ids.index(reference) if reference else len(ids) // 2)
 
     def _remember(self, key: Hashable, work: Any) -> Any:
         if key not in self._memory:

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import Edge
-from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.pose_graph import chained_covariance, invert_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId

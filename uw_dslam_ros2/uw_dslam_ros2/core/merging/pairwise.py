@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
+from uw_dslam_ros2.core.merging.answers import Answer, Query, QueryKey
+from uw_dslam_ros2.core.merging.components import Component, Constraint
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.plan import Plan
-from uw_dslam_ros2.core.merging.settling import Component, Constraint
-from uw_dslam_ros2.core.merging.units import Unit
+from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
@@ -23,7 +23,7 @@ __all__ = ["make_pairwise_plan"]
 def make_pairwise_plan(
     library: Library,
     vehicles: Sequence[str],
-    answers: Mapping[MatchKey, Answer],
+    answers: Mapping[QueryKey, Answer],
     anchor: SubmapId,
     *,
     is_growing: bool = False,
@@ -56,8 +56,8 @@ def make_pairwise_plan(
     num_refused = 0
     while len(queue) > 1 and num_refused < len(queue):
         first, rest = queue[0], queue[1:]
-        units = [_unit(library, component, is_growing) for component in (first, *rest)]
-        merged = _merge_first(verifier, first, rest, units, constraints, refused)
+        groups = [_group(library, component, is_growing) for component in (first, *rest)]
+        merged = _merge_first(verifier, first, rest, groups, constraints, refused)
         if verifier.wanted:
             break
         if merged is None:
@@ -77,7 +77,7 @@ def _vehicle_map(library: Library, vehicle: str) -> Component:
     return {i: T_first_odom @ library.odometry.T_odom_submap(i) for i in ids}
 
 
-def _unit(library: Library, component: Component, is_growing: bool) -> Unit:
+def _group(library: Library, component: Component, is_growing: bool) -> SubmapGroup:
     """What is matched of a map: all, or the first 1, 2, 4, 8, ... submaps of each vehicle."""
     side = library.component_side(component)
     if is_growing:
@@ -86,24 +86,24 @@ def _unit(library: Library, component: Component, is_growing: bool) -> Unit:
             members.setdefault(submap_id[0], []).append(submap_id)
         begun = [i for ids in members.values() for i in ids[: 1 << (len(ids).bit_length() - 1)]]
         side = Side({i: side.T_frame_submap[i] for i in begun}, side.covariance)
-    return library.component_unit(side)
+    return library.component_group(side)
 
 
 def _merge_first(
     verifier: Verifier,
     first: Component,
     rest: Sequence[Component],
-    units: Sequence[Unit],
+    groups: Sequence[SubmapGroup],
     constraints: list[Constraint],
     refused: set[frozenset[bytes]],
 ) -> tuple[int, Component] | None:
     """Index of the map that the first one was merged with, and the merged map."""
-    target = units[0]
-    for index, (other, source) in enumerate(zip(rest, units[1:], strict=True)):
+    target = groups[0]
+    for index, (other, source) in enumerate(zip(rest, groups[1:], strict=True)):
         pair = frozenset((source.key, target.key))
         if pair in refused:
             continue  # asked the other way round
-        answer = verifier.ask(Match(source, target))
+        answer = verifier.ask(Query(source, target))
         if answer is None:
             return None
         refused.add(pair)

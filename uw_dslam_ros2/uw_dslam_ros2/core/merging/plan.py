@@ -25,14 +25,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
-from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
+from uw_dslam_ros2.core.merging.answers import Answer, Query, QueryKey
+from uw_dslam_ros2.core.merging.components import Component, Constraint
 from uw_dslam_ros2.core.merging.config import VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.library import Library
-from uw_dslam_ros2.core.merging.settling import Component, Constraint
+from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.merging.types import Edge
-from uw_dslam_ros2.core.merging.units import Unit
 from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.submap import SubmapId
 
@@ -46,7 +46,7 @@ _MAX_PART_SEARCHES = 4
 class Plan:
     """Where everything is, as far as is known, and what to ask next."""
 
-    wanted: list[Match]
+    wanted: list[Query]
     constraints: list[Constraint]
     odometry: list[Edge]
     components: list[Component]
@@ -55,8 +55,8 @@ class Plan:
 
 def make_plan(
     library: Library,
-    answers: Mapping[MatchKey, Answer],
-    standing: AbstractSet[MatchKey],
+    answers: Mapping[QueryKey, Answer],
+    standing: AbstractSet[QueryKey],
     anchor: SubmapId,
     config: MapQueueConfig,
 ) -> Plan:
@@ -85,19 +85,19 @@ class _Planner:
     def __init__(
         self,
         library: Library,
-        answers: Mapping[MatchKey, Answer],
-        standing: AbstractSet[MatchKey],
+        answers: Mapping[QueryKey, Answer],
+        standing: AbstractSet[QueryKey],
         anchor: SubmapId,
         config: MapQueueConfig,
     ) -> None:
         self._library, self._config, self._anchor = library, config, anchor
         self._answers, self._standing = answers, standing
         self._verifier = Verifier(library, answers)
-        self._units = library.whole_units()
+        self._groups = library.whole_groups()
 
     def run(self) -> Plan:
         """Work the plan out; the steps of the module's description."""
-        ranked = self._ranked(self._units)
+        ranked = self._ranked(self._groups)
         first = most_promising(ranked, self._config.max_partners)
         constraints = self._match_vehicles(first)
         if not self._is_waiting():
@@ -105,7 +105,7 @@ class _Planner:
             constraints += self._match_vehicles(apart)
         if not self._is_waiting():
             constraints += self._match_meeting(constraints)
-        for _ in range(len(self._units)):
+        for _ in range(len(self._groups)):
             if self._is_waiting():
                 break
             more = self._match_components(constraints)
@@ -119,40 +119,40 @@ class _Planner:
     def _is_waiting(self) -> bool:
         return bool(self._verifier.wanted)
 
-    def _ranked(self, units: Mapping[str, Unit]) -> list[tuple[str, str]]:
+    def _ranked(self, groups: Mapping[str, SubmapGroup]) -> list[tuple[str, str]]:
         """Pairs of vehicles, most promising first."""
-        shapes = {vehicle: self._library.shape(unit) for vehicle, unit in units.items()}
-        pairs = itertools.combinations(sorted(units), 2)
+        shapes = {vehicle: self._library.shape(group) for vehicle, group in groups.items()}
+        pairs = itertools.combinations(sorted(groups), 2)
         return sorted(pairs, key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
 
     def _match_vehicles(self, pairs: Iterable[tuple[str, str]]) -> list[Constraint]:
         constraints: list[Constraint] = []
         for target, source in pairs:
-            match = Match(self._units[source], self._units[target])
+            query = Query(self._groups[source], self._groups[target])
             sides = self._library.vehicle_side(source), self._library.vehicle_side(target)
-            constraints += self._verifier.constraints_of(match, *sides)
+            constraints += self._verifier.constraints_of(query, *sides)
         return constraints
 
     def _apart(
         self, constraints: Sequence[Constraint], pairs: Iterable[tuple[str, str]]
     ) -> list[tuple[str, str]]:
         """Pairs whose vehicles are in different components."""
-        _, components = self._settle(constraints)
+        _, components = self._solve(constraints)
         where = component_numbers(components)
-        return [(a, b) for a, b in pairs if where[self._unit_id(a)] != where[self._unit_id(b)]]
+        return [(a, b) for a, b in pairs if where[self._group_id(a)] != where[self._group_id(b)]]
 
-    def _unit_id(self, vehicle: str) -> SubmapId:
-        return self._units[vehicle].reference
+    def _group_id(self, vehicle: str) -> SubmapId:
+        return self._groups[vehicle].reference
 
     def _match_meeting(self, constraints: Sequence[Constraint]) -> list[Constraint]:
         """Step 3: a prior from the graph for vehicles without a match of their own."""
-        settled, components = self._settle(constraints)
+        solved, components = self._solve(constraints)
         where = component_numbers(components)
-        matched = {frozenset((j.edge.source[0], j.edge.target[0])) for j in settled if j.is_inlier}
+        matched = {frozenset((j.edge.source[0], j.edge.target[0])) for j in solved if j.is_inlier}
         found: list[Constraint] = []
-        for target, source in itertools.combinations(sorted(self._units), 2):
-            index = where[self._unit_id(target)]
-            if frozenset((source, target)) in matched or index != where[self._unit_id(source)]:
+        for target, source in itertools.combinations(sorted(self._groups), 2):
+            index = where[self._group_id(target)]
+            if frozenset((source, target)) in matched or index != where[self._group_id(source)]:
                 continue
             component = components[index]
             sides = [self._library.component_side(component, v) for v in (source, target)]
@@ -161,10 +161,10 @@ class _Planner:
 
     def _match_components(self, constraints: Sequence[Constraint]) -> list[Constraint]:
         """Step 4."""
-        _, components = self._settle(constraints)
+        _, components = self._solve(constraints)
         sides = [self._library.component_side(component) for component in components]
         sides = [side for side in sides if side.T_frame_submap]
-        candidates: list[tuple[float, Match, Side, Side]] = []
+        candidates: list[tuple[float, Query, Side, Side]] = []
         for target, source in itertools.combinations(sides, 2):
             candidates += self._between(source, target)
             candidates += self._between(target, source, is_turned=True)
@@ -172,21 +172,21 @@ class _Planner:
         found: list[Constraint] = []
         taken: dict[frozenset[SubmapId], int] = {}
         seen = {frozenset((key[0], key[1])) for key in self._verifier.visited}
-        for _, match, source_side, target_side in candidates:
-            units = frozenset((match.source.key, match.target.key))
-            if units in seen:
+        for _, query, source_side, target_side in candidates:
+            groups = frozenset((query.source.key, query.target.key))
+            if groups in seen:
                 continue  # asked before, perhaps the other way round
-            seen.add(units)
+            seen.add(groups)
             ends = frozenset((min(source_side.T_frame_submap), min(target_side.T_frame_submap)))
             taken[ends] = taken.get(ends, 0) + 1
             if taken[ends] <= _MAX_PART_SEARCHES:
-                found += self._verifier.constraints_of(match, source_side, target_side)
+                found += self._verifier.constraints_of(query, source_side, target_side)
         return found
 
     def _tighten(self, constraints: Sequence[Constraint]) -> list[Constraint]:
         """Step 5."""
-        settled, components = self._settle(constraints)
-        inliers = [constraint for constraint in settled if constraint.is_inlier]
+        solved, components = self._solve(constraints)
+        inliers = [constraint for constraint in solved if constraint.is_inlier]
         found: list[Constraint] = []
         for component in components:
             side = self._library.component_side(component)
@@ -198,38 +198,38 @@ class _Planner:
 
     def _between(
         self, source: Side, target: Side, *, is_turned: bool = False
-    ) -> list[tuple[float, Match, Side, Side]]:
+    ) -> list[tuple[float, Query, Side, Side]]:
         """Parts of one component (or all of it) against all of another, with their promise."""
-        whole = self._library.component_unit(target)
+        whole = self._library.component_group(target)
         target_shape = self._library.shape(whole)
-        units = self._library.parts(source)
+        groups = self._library.parts(source)
         vehicles = {i[0] for side in (source, target) for i in side.T_frame_submap}
         if len(vehicles) > 2 and not is_turned:
-            units.append(self._library.component_unit(source))
+            groups.append(self._library.component_group(source))
         found = []
-        for unit in units:
-            worth = promise(self._library.shape(unit), target_shape)
-            found.append((worth, Match(unit, whole), source, target))
+        for group in groups:
+            worth = promise(self._library.shape(group), target_shape)
+            found.append((worth, Query(group, whole), source, target))
         return found
 
     def _finish(self, constraints: list[Constraint]) -> Plan:
-        settled, components = self._settle(constraints)
-        carried = self._carried(settled, components)
+        solved, components = self._solve(constraints)
+        carried = self._carried(solved, components)
         if carried:
-            settled, components = self._settle([*constraints, *carried])
-        wanted = sorted(self._verifier.wanted.values(), key=self._is_joined(settled))
-        return Plan(wanted, settled, self._library.odometry.edges, components)
+            solved, components = self._solve([*constraints, *carried])
+        wanted = sorted(self._verifier.wanted.values(), key=self._is_joined(solved))
+        return Plan(wanted, solved, self._library.odometry.edges, components)
 
     def _carried(
-        self, settled: Sequence[Constraint], components: Sequence[Component]
+        self, solved: Sequence[Constraint], components: Sequence[Component]
     ) -> list[Constraint]:
         """Standing answers that this plan has not asked for, where it has nothing of its own."""
-        own = {frozenset((j.edge.source[0], j.edge.target[0])) for j in settled if j.is_inlier}
+        own = {frozenset((j.edge.source[0], j.edge.target[0])) for j in solved if j.is_inlier}
         where = component_numbers(components)
         carried: list[Constraint] = []
         for key in sorted(self._standing - self._verifier.visited):
             answer = self._answers.get(key)
-            if answer is None or not self._library.holds(answer.match):
+            if answer is None or not self._library.holds(answer.query):
                 continue
             constraint = self._verifier.constraint(answer)
             ends = constraint.edge.source, constraint.edge.target
@@ -244,15 +244,15 @@ class _Planner:
             frozenset((j.edge.source[0], j.edge.target[0])) for j in constraints if j.is_inlier
         }
 
-        def key(match: Match) -> bool:
-            return frozenset((match.source.reference[0], match.target.reference[0])) in joined
+        def key(query: Query) -> bool:
+            return frozenset((query.source.reference[0], query.target.reference[0])) in joined
 
         return key
 
-    def _settle(
+    def _solve(
         self, constraints: Sequence[Constraint]
     ) -> tuple[list[Constraint], list[Component]]:
-        return self._library.settle(self._anchor, constraints)
+        return self._library.solve(self._anchor, constraints)
 
 
 def most_promising(ranked: Sequence[tuple[str, str]], max_partners: int) -> list[tuple[str, str]]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging.answers import Answer, Match, MatchKey
+from uw_dslam_ros2.core.merging.answers import Answer, Query, QueryKey
+from uw_dslam_ros2.core.merging.components import LoopError, loop_errors
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MapQueueConfig
 from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
 from uw_dslam_ros2.core.merging.growing import make_growing_plan
@@ -18,15 +19,14 @@ from uw_dslam_ros2.core.merging.library import Library, Memory
 from uw_dslam_ros2.core.merging.pairwise import make_pairwise_plan
 from uw_dslam_ros2.core.merging.plan import Plan, make_plan
 from uw_dslam_ros2.core.merging.records import constraints_of, records_of
-from uw_dslam_ros2.core.merging.settling import LoopError, loop_errors
 from uw_dslam_ros2.core.merging.state import QueueState
+from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     MapProvenance,
     MatchRequest,
     SubmapRecord,
 )
-from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
@@ -53,11 +53,11 @@ class MapQueue:
         self._anchor: SubmapId | None = None
         self._is_pinned = False  # for good: named by the settings, or vehicles are joined in it
         self._vehicles: list[str] = []
-        self._answers: dict[MatchKey, Answer] = {}
-        self._standing: frozenset[MatchKey] = frozenset()
+        self._answers: dict[QueryKey, Answer] = {}
+        self._standing: frozenset[QueryKey] = frozenset()
         self._memory: Memory = {}
         self._library: Library | None = None
-        self._in_flight: dict[int, Match] = {}
+        self._in_flight: dict[int, Query] = {}
         self._next_request_id = 1
         self._plan_cache: Plan | None = None
         self._lattice: GridSpec | None = None
@@ -104,22 +104,22 @@ class MapQueue:
 
         Each stays in flight until `add_result` or `cancel_request`.
         """
-        asked = {match.key for match in self._in_flight.values()}
+        asked = {query.key for query in self._in_flight.values()}
         requests: list[MatchRequest] = []
-        for match in self._plan().wanted:
+        for query in self._plan().wanted:
             if len(requests) >= max_requests:
                 break
-            if match.key not in asked:
-                asked.add(match.key)
-                requests.append(self._request(match))
+            if query.key not in asked:
+                asked.add(query.key)
+                requests.append(self._request(query))
         return requests
 
     def add_result(self, request_id: int, result: RegistrationResult) -> None:
         """Take the answer to a request; one that is not in flight changes nothing."""
-        match = self._in_flight.pop(request_id, None)
-        if match is None:
+        query = self._in_flight.pop(request_id, None)
+        if query is None:
             return
-        self._answers[match.key] = Answer.of(match, result)
+        self._answers[query.key] = Answer.of(query, result)
         self._change()
 
     def cancel_request(self, request_id: int) -> None:
@@ -182,9 +182,9 @@ class MapQueue:
         used = {constraint.key for constraint in self._plan().constraints if constraint.is_inlier}
         by_question = sorted(
             self._answers.values(),
-            key=lambda a: (a.match.target.ids, a.match.source.ids, a.match.key),
+            key=lambda a: (a.query.target.ids, a.query.source.ids, a.query.key),
         )
-        return [(answer, answer.match.key in used) for answer in by_question]
+        return [(answer, answer.query.key in used) for answer in by_question]
 
     def constraints(self) -> list[Constraint]:
         """All edges of the pose graph with what is left of them after optimisation."""
@@ -256,7 +256,7 @@ class MapQueue:
             stored = StoredSubmap.of(submap, queue._config.max_submap_cells)
             queue._submaps[submap.submap_id] = stored
         queue._withdrawn = set(state.withdrawn)
-        queue._answers = {answer.match.key: answer for answer in state.answers}
+        queue._answers = {answer.query.key: answer for answer in state.answers}
         queue._standing = frozenset(state.standing)
         queue._anchor, queue._lattice = state.anchor, state.lattice
         queue._is_pinned = state.is_pinned
@@ -328,21 +328,21 @@ class MapQueue:
         self._global_map = None
         self._is_drawn = False
 
-    def _request(self, match: Match) -> MatchRequest:
+    def _request(self, query: Query) -> MatchRequest:
         request_id = self._next_request_id
         self._next_request_id += 1
-        self._in_flight[request_id] = match
+        self._in_flight[request_id] = query
         library = self._current_library()
-        source, target = library.render(match.source), library.render(match.target)
+        source, target = library.render(query.source), library.render(query.target)
         return MatchRequest(
             request_id,
             source,
             target,
-            match.prior,
-            match.source.ids,
-            match.target.ids,
-            match.source.reference,
-            match.target.reference,
+            query.prior,
+            query.source.ids,
+            query.target.ids,
+            query.source.reference,
+            query.target.reference,
         )
 
     def _drawn(self) -> GlobalMap | None:

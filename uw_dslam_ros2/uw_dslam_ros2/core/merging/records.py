@@ -7,13 +7,13 @@ from collections.abc import Set as AbstractSet
 
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers
+from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,
     SubmapRecord,
     SubmapState,
 )
-from uw_dslam_ros2.core.merging.units import StoredSubmap
 from uw_dslam_ros2.core.pose_graph import residual
 from uw_dslam_ros2.core.submap import SubmapId
 
@@ -106,7 +106,7 @@ def _wait_reason(vehicle: str, answers: Sequence[Answer]) -> str:
         answer.why
         for answer in answers
         if not answer.is_accepted
-        and vehicle in (answer.match.source.reference[0], answer.match.target.reference[0])
+        and vehicle in (answer.query.source.reference[0], answer.query.target.reference[0])
     ]
     return reasons[-1] if reasons else "not matched yet"
 
@@ -114,7 +114,7 @@ def _wait_reason(vehicle: str, answers: Sequence[Answer]) -> str:
 def _num_tries(answers: Sequence[Answer]) -> dict[str, int]:
     tries: dict[str, int] = {}
     for answer in answers:
-        for unit in (answer.match.source, answer.match.target):
-            for vehicle in {submap_id[0] for submap_id in unit.ids}:
+        for group in (answer.query.source, answer.query.target):
+            for vehicle in {submap_id[0] for submap_id in group.ids}:
                 tries[vehicle] = tries.get(vehicle, 0) + 1
     return tries

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uw_dslam_ros2.core.grid import GridSpec
-from uw_dslam_ros2.core.merging.answers import Answer, MatchKey
+from uw_dslam_ros2.core.merging.answers import Answer, QueryKey
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = ["QueueState"]
@@ -29,7 +29,7 @@ class QueueState:
     vehicles: tuple[str, ...]
     """In order of first arrival."""
     next_request_id: int
-    standing: frozenset[MatchKey]
+    standing: frozenset[QueryKey]
     """Answers that hold in the graph."""
     is_pinned: bool = False
     """Whether the global frame stays where it is, whatever comes."""

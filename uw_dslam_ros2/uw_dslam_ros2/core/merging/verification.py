@@ -8,7 +8,8 @@ from collections.abc import Container, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.merging.answers import Answer, AnswerBook, Match, MatchKey, Use
+from uw_dslam_ros2.core.merging.answers import Answer, AnswerBook, Query, QueryKey, Use
+from uw_dslam_ros2.core.merging.components import Constraint
 from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, MAX_CHECKS, NUM_NEIGHBOURS
 from uw_dslam_ros2.core.merging.consistency import Side
 from uw_dslam_ros2.core.merging.constraints import constraint_of
@@ -20,7 +21,6 @@ from uw_dslam_ros2.core.merging.places import (
     sigma_m,
     vague_places,
 )
-from uw_dslam_ros2.core.merging.settling import Constraint
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.voting import ENOUGH_ODDS, Vote, vote_of, weigh
 from uw_dslam_ros2.core.pose_graph import invert_covariance
@@ -50,26 +50,26 @@ class Verifier:
     def __init__(
         self,
         library: Library,
-        answers: Mapping[MatchKey, Answer],
+        answers: Mapping[QueryKey, Answer],
         *,
         is_lenient: bool = False,
     ) -> None:
         self._library = library
         self._book = AnswerBook(answers, is_lenient=is_lenient)
-        self.wanted: dict[MatchKey, Match] = {}
-        self.visited: set[MatchKey] = set()
+        self.wanted: dict[QueryKey, Query] = {}
+        self.visited: set[QueryKey] = set()
 
-    def constraints_of(self, match: Match, source: Side, target: Side) -> list[Constraint]:
+    def constraints_of(self, query: Query, source: Side, target: Side) -> list[Constraint]:
         """Constraints that a match and its checks make; none while an answer is missing.
 
         Parameters
         ----------
-        match
+        query
             The question, without a prior.
         source, target
             All that the two maps belong to.
         """
-        answer = self.ask(match)
+        answer = self.ask(query)
         if answer is None or answer.use < Use.CLAIM:
             return []
         main = self._vote(answer)
@@ -79,10 +79,10 @@ class Verifier:
             @ edge.T_target_source
             @ source.T_frame_submap[edge.source].inverse()
         )
-        checks = self._checks(match, edge, T_target_source, source, target)
+        checks = self._checks(query, edge, T_target_source, source, target)
         if not checks:
             # Two single submaps are all there is to ask about; otherwise they would have met.
-            is_single = len(match.source.ids) == len(match.target.ids) == 1
+            is_single = len(query.source.ids) == len(query.target.ids) == 1
             return [main.constraint] if is_single and answer.is_accepted else []
         step = MAX_CHECKS
         for count in range(step, len(checks) + step, step):
@@ -121,7 +121,7 @@ class Verifier:
         places = vague_places(
             self._library, side, edges, NUM_NEIGHBOURS, vague_cells, limit, chosen
         )
-        groups: dict[frozenset[str], list[Match]] = {}
+        groups: dict[frozenset[str], list[Query]] = {}
         for ends, uncertainty in places:
             check = self._check(ends, side.between(ends[1], ends[0]), uncertainty)
             groups.setdefault(frozenset((ends[0][0], ends[1][0])), []).append(check)
@@ -145,25 +145,25 @@ class Verifier:
         """The edge of an answer; see `constraint_of`."""
         return constraint_of(self._library, answer)
 
-    def ask(self, match: Match) -> Answer | None:
+    def ask(self, query: Query) -> Answer | None:
         """The answer, if there is one; otherwise the question is noted as wanted."""
-        answer = self._book.find_similar(match)
+        answer = self._book.find_similar(query)
         if answer is not None:
             return answer
-        self.visited.add(match.key)
-        answer = self._book.find(match)
+        self.visited.add(query.key)
+        answer = self._book.find(query)
         if answer is None:
-            self.wanted.setdefault(match.key, match)
+            self.wanted.setdefault(query.key, query)
         return answer
 
     def _checks(
         self,
-        match: Match | None,
+        query: Query | None,
         main: Edge | None,
         T_target_source: SE2,
         source: Side,
         target: Side,
-    ) -> list[Match]:
+    ) -> list[Query]:
         """Questions at the places where the two sides share most, away from each other."""
         places = meetings(
             self._library,
@@ -173,12 +173,12 @@ class Verifier:
             NUM_NEIGHBOURS,
             _NUM_ROUNDS * MAX_CHECKS,
         )
-        checks: list[Match] = []
+        checks: list[Query] = []
         for source_id, target_id in places:
-            units = self._library.window(source_id), self._library.window(target_id)
-            if match is not None and (match.source.ids, match.target.ids) == (
-                units[0].ids,
-                units[1].ids,
+            groups = self._library.window(source_id), self._library.window(target_id)
+            if query is not None and (query.source.ids, query.target.ids) == (
+                groups[0].ids,
+                groups[1].ids,
             ):
                 continue  # the same maps once more would confirm themselves
             T_between = (
@@ -192,7 +192,7 @@ class Verifier:
             )
         return checks
 
-    def _check(self, ends: Ends, T_target_source: SE2, covariance: FloatArray) -> Match:
+    def _check(self, ends: Ends, T_target_source: SE2, covariance: FloatArray) -> Query:
         """A question near a guess; always the same way round, so that none is asked twice."""
         if ends[0] < ends[1]:
             covariance = invert_covariance(covariance, T_target_source)
@@ -201,7 +201,7 @@ class Verifier:
         radius_m = max(self._library.submaps[i].radius_m for i in ends)
         half_m = _PRIOR_SIGMA * sigma_m(covariance) + _PRIOR_SHARE * radius_m
         half_rad = _PRIOR_SIGMA * math.sqrt(float(covariance[2, 2])) + _PRIOR_RAD
-        return Match(source, target, _prior_around(T_target_source, half_m, half_rad))
+        return Query(source, target, _prior_around(T_target_source, half_m, half_rad))
 
     def _vote(self, answer: Answer) -> Vote:
         return vote_of(self.constraint(answer), answer)
@@ -214,10 +214,10 @@ class Verifier:
     ) -> tuple[list[Constraint], float]:
         return weigh(votes, num_checks, source, target, INLIER_PROBABILITY)
 
-    def _ask_all(self, matches: Sequence[Match]) -> list[Answer] | None:
+    def _ask_all(self, queries: Sequence[Query]) -> list[Answer] | None:
         """All answers, or None while one is missing."""
-        replies = [reply for match in matches if (reply := self.ask(match)) is not None]
-        return replies if len(replies) == len(matches) else None
+        replies = [reply for query in queries if (reply := self.ask(query)) is not None]
+        return replies if len(replies) == len(queries) else None
 
 
 def _prior_around(guess: SE2, half_width_m: float, half_width_rad: float) -> PriorWindow:

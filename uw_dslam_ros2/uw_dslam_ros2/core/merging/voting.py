@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.components import Constraint
 from uw_dslam_ros2.core.merging.consistency import Side, consistent_set, cycle_of
-from uw_dslam_ros2.core.merging.settling import Constraint
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.pose_graph import chi2_threshold
 from uw_dslam_ros2.core.registration.result import PriorWindow
@@ -38,7 +38,7 @@ class Vote:
 
 def vote_of(constraint: Constraint, answer: Answer) -> Vote:
     """An answer, with the edge that it would make, as a vote."""
-    return Vote(constraint, answer.match.prior, answer.is_accepted)
+    return Vote(constraint, answer.query.prior, answer.is_accepted)
 
 
 def weigh(

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 
 import networkx as nx
 
-from uw_dslam_ros2.core.merging.answers import MatchKey
+from uw_dslam_ros2.core.merging.answers import QueryKey
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.pose_graph import solve_graph
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
-__all__ = ["Component", "Constraint", "LoopError", "loop_errors", "settle"]
+__all__ = ["Component", "Constraint", "LoopError", "loop_errors", "solve_components"]
 
 Component = dict[SubmapId, SE2]
 """``T_component_submap``."""
@@ -24,7 +24,7 @@ Component = dict[SubmapId, SE2]
 class Constraint:
     """An accepted registration in the graph."""
 
-    key: MatchKey
+    key: QueryKey
     edge: Edge
     probability: float
     is_inlier: bool = True
@@ -41,7 +41,7 @@ class LoopError:
     error_rad: float
 
 
-def settle(
+def solve_components(
     submaps: Iterable[SubmapId],
     anchor: SubmapId,
     odometry: Sequence[Edge],
@@ -75,10 +75,10 @@ def settle(
                     num_dropped += 1
             components.append(solution.T_anchor_pose)
         if num_dropped == 0:
-            settled = [
+            solved = [
                 replace(constraint, is_inlier=is_inlier[constraint.key]) for constraint in ordered
             ]
-            return settled, components
+            return solved, components
 
 
 def loop_errors(odometry: Sequence[Edge], constraints: Sequence[Constraint]) -> list[LoopError]:

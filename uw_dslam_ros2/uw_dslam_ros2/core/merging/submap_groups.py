@@ -19,7 +19,7 @@ from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
-__all__ = ["StoredSubmap", "Unit", "render_unit", "shared_area_m2"]
+__all__ = ["StoredSubmap", "SubmapGroup", "render_group", "shared_area_m2"]
 
 FloatArray = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class StoredSubmap:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unit:
+class SubmapGroup:
     """Submaps placed in the frame of one of them, the reference."""
 
     reference: SubmapId
@@ -85,7 +85,7 @@ class Unit:
     @classmethod
     def of(
         cls, members: Sequence[StoredSubmap], T_frame_submap: Sequence[SE2], reference: int
-    ) -> Unit:
+    ) -> SubmapGroup:
         """Place members by poses in any common frame; `reference` is an index."""
         T_reference_frame = T_frame_submap[reference].inverse()
         poses: dict[SubmapId, SE2] = {}
@@ -106,13 +106,13 @@ class Unit:
         return tuple(self.T_reference_submap)
 
 
-def render_unit(
-    unit: Unit, submaps: Mapping[SubmapId, StoredSubmap], log_odds_max: float
+def render_group(
+    group: SubmapGroup, submaps: Mapping[SubmapId, StoredSubmap], log_odds_max: float
 ) -> OccupancyMap | None:
-    """Fuse a unit's submaps on the lattice of its reference; None where nothing was seen."""
-    spec = submaps[unit.reference].submap.grid.spec
+    """Fuse a group's submaps on the lattice of its reference; None where nothing was seen."""
+    spec = submaps[group.reference].submap.grid.spec
     lattice = GridSpec(spec.resolution_m, 1, 1, spec.T_frame_grid)
-    placed = [(submaps[i].submap.grid, T) for i, T in unit.T_reference_submap.items()]
+    placed = [(submaps[i].submap.grid, T) for i, T in group.T_reference_submap.items()]
     return fuse_maps(lattice, placed, log_odds_max)
 
 
