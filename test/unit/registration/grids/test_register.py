@@ -188,9 +188,9 @@ def test_different_places_are_refused():
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of the mean of no other peaks
 def test_different_places_on_large_canvases_are_refused():
     """Little is left of the walls on the searched lattice: not even chance has a peak there."""
-    pair = make_pair("office", 0.7, "clean", 1, is_matching=False)
+    pair = make_pair("cave", 0.7, "clean", 4, is_matching=False)
     maps = []
-    for grid, (row, col) in ((pair.source, (1900, 1300)), (pair.target, (2000, 2000))):
+    for grid, (row, col) in ((pair.source, (1900, 1333)), (pair.target, (2000, 2000))):
         values = np.full((4000, 4000), -1, np.int8)
         rows, cols = grid.spec.shape
         values[row : row + rows, col : col + cols] = grid.values
