@@ -88,7 +88,7 @@ def ping(is_quick: bool) -> None:
     stages.wrap(section.GrowingGrid, "add", "occupancy grid")
     stages.wrap(section.OpenSection, "close", "closing submaps")
     mapper = VehicleMapper(VehicleMapperConfig(), "auv_1")
-    stages.wrap(mapper._estimator, "settle", "loops")
+    stages.wrap(mapper._estimator, "close_loops", "loops")
     per_ping: list[float] = []
     front_end: list[float] = []
     for message in messages[:3]:  # compile

@@ -137,9 +137,9 @@ def test_settings_of_the_registration_reach_the_engine(tmp_path, monkeypatch):
 class _Empty:
     """A submap of which nothing is asked."""
 
-    evidence = property(lambda self: self)
+    grid = property(lambda self: self)
 
-    def unpacked(self):
+    def decompressed(self):
         return self
 
     def to_occupancy(self, _log_odds_max):

@@ -35,13 +35,13 @@ def random_ping(rng):
     return ping(ranges, bearings, weight=rng.uniform(0.2, 1.0))
 
 
-def evidence_at(grid, x, y):
+def log_odds_at(grid, x, y):
     part = grid.trimmed()
     row = math.floor(y / part.resolution_m) - part.row
     col = math.floor(x / part.resolution_m) - part.col
-    if not (0 <= row < part.evidence.shape[0] and 0 <= col < part.evidence.shape[1]):
+    if not (0 <= row < part.log_odds.shape[0] and 0 <= col < part.log_odds.shape[1]):
         return None
-    return part.evidence[row, col] / UNITS_PER_NAT if part.observed[row, col] else None
+    return part.log_odds[row, col] / UNITS_PER_NAT if part.observed[row, col] else None
 
 
 def test_target_to_port_is_mapped_to_port():
@@ -49,11 +49,11 @@ def test_target_to_port_is_mapped_to_port():
     # The vehicle looks north; 5 m away, 30 degrees to port, is north-west.
     grid.add(ping([5.0], [math.pi / 6]), SE2(10.0, 20.0, math.pi / 2))
     x, y = 10.0 - 2.5, 20.0 + 4.330127
-    assert evidence_at(grid, x, y) == pytest.approx(CONFIG.hit_log_odds, abs=0.001)
-    assert evidence_at(grid, 10.0 - 1.25, 20.0 + 2.165) == pytest.approx(-CONFIG.free_log_odds)
-    assert evidence_at(grid, 10.0 + 2.5, y) is None
+    assert log_odds_at(grid, x, y) == pytest.approx(CONFIG.hit_log_odds, abs=0.001)
+    assert log_odds_at(grid, 10.0 - 1.25, 20.0 + 2.165) == pytest.approx(-CONFIG.free_log_odds)
+    assert log_odds_at(grid, 10.0 + 2.5, y) is None
     beyond = 6.0 / 5.0
-    assert evidence_at(grid, 10.0 - 2.5 * beyond, 20.0 + 4.33 * beyond) is None
+    assert log_odds_at(grid, 10.0 - 2.5 * beyond, 20.0 + 4.33 * beyond) is None
 
 
 def test_free_water_is_what_the_obvious_loop_says(rng):
@@ -71,19 +71,19 @@ def test_free_water_is_what_the_obvious_loop_says(rng):
             continue
         is_free = away.min() < 0.75 * 0.08 and math.hypot(lx, ly) < 3.0 - 0.15
         checked += 1
-        wrong += (evidence_at_fast(grid, x, y) is not None) != is_free
+        wrong += (log_odds_at_fast(grid, x, y) is not None) != is_free
     assert checked > 9000
     assert wrong == 0
 
 
-def evidence_at_fast(grid, x, y, cache={}):  # noqa: B006 (a cache)
+def log_odds_at_fast(grid, x, y, cache={}):  # noqa: B006 (a cache)
     if cache.get("grid") is not grid:
         cache.clear()
         cache.update(grid=grid, part=grid.trimmed())
     part = cache["part"]
     row = math.floor(y / part.resolution_m) - part.row
     col = math.floor(x / part.resolution_m) - part.col
-    inside = 0 <= row < part.evidence.shape[0] and 0 <= col < part.evidence.shape[1]
+    inside = 0 <= row < part.log_odds.shape[0] and 0 <= col < part.log_odds.shape[1]
     return True if inside and part.observed[row, col] else None
 
 
@@ -117,7 +117,7 @@ def test_order_of_pings_does_not_matter(rng):
         grids.append(grid.trimmed())
     for other in grids[1:]:
         assert (grids[0].row, grids[0].col) == (other.row, other.col)
-        np.testing.assert_array_equal(grids[0].evidence, other.evidence)
+        np.testing.assert_array_equal(grids[0].log_odds, other.log_odds)
         np.testing.assert_array_equal(grids[0].observed, other.observed)
 
 
@@ -128,9 +128,9 @@ def test_growth_moves_no_cell(rng):
     before = grid.trimmed()
     grid.add(far, SE2(-200.0, 300.0, 1.0))
     after = grid.trimmed()
-    rows = slice(before.row - after.row, before.row - after.row + before.evidence.shape[0])
-    cols = slice(before.col - after.col, before.col - after.col + before.evidence.shape[1])
-    np.testing.assert_array_equal(after.evidence[rows, cols], before.evidence)
+    rows = slice(before.row - after.row, before.row - after.row + before.log_odds.shape[0])
+    cols = slice(before.col - after.col, before.col - after.col + before.log_odds.shape[1])
+    np.testing.assert_array_equal(after.log_odds[rows, cols], before.log_odds)
     spec = after.to_occupancy(4.0).spec
     for value in (spec.T_frame_grid.x, spec.T_frame_grid.y):
         assert value / 0.1 == pytest.approx(round(value / 0.1), abs=1e-9)
@@ -141,16 +141,16 @@ def test_one_ping_counts_once_in_a_cell():
     grid = GrowingGrid(CONFIG)
     grid.add(ping(np.full(21, 2.0), np.linspace(-0.01, 0.01, 21), beamwidth=0.02), SE2(0, 0.05, 0))
     part = grid.trimmed()
-    assert part.evidence.min() == -round(CONFIG.free_log_odds * UNITS_PER_NAT)
-    assert part.evidence.max() <= round(CONFIG.hit_log_odds * UNITS_PER_NAT)
+    assert part.log_odds.min() == -round(CONFIG.free_log_odds * UNITS_PER_NAT)
+    assert part.log_odds.max() <= round(CONFIG.hit_log_odds * UNITS_PER_NAT)
 
 
 def test_weak_echo_stays_weak():
     strong, weak = GrowingGrid(CONFIG), GrowingGrid(CONFIG)
     strong.add(ping([3.0], [0.0], weight=1.0), SE2())
     weak.add(ping([3.0], [0.0], weight=0.2), SE2())
-    assert evidence_at(weak, 3.0, 0.0) == pytest.approx(
-        0.2 * evidence_at(strong, 3.0, 0.0), abs=2e-3
+    assert log_odds_at(weak, 3.0, 0.0) == pytest.approx(
+        0.2 * log_odds_at(strong, 3.0, 0.0), abs=2e-3
     )
 
 
@@ -158,8 +158,8 @@ def test_packing_loses_nothing(rng):
     grid = GrowingGrid(CONFIG)
     grid.add(random_ping(rng), SE2(3.0, 4.0, 1.0))
     part = grid.trimmed()
-    again = part.packed().unpacked()
-    np.testing.assert_array_equal(part.evidence, again.evidence)
+    again = part.compressed().decompressed()
+    np.testing.assert_array_equal(part.log_odds, again.log_odds)
     np.testing.assert_array_equal(part.observed, again.observed)
     assert (part.row, part.col) == (again.row, again.col)
 
@@ -175,12 +175,12 @@ def test_percent_is_the_logistic_function():
     assert (found.values == -1).any()
 
 
-def test_a_packed_grid_is_drawn_as_the_grid_itself(rng):
+def test_a_compressed_grid_is_drawn_as_the_grid_itself(rng):
     grid = GrowingGrid(CONFIG)
     grid.add(random_ping(rng), SE2(3.0, 4.0, 1.0))
     part = grid.trimmed()
     direct = part.to_occupancy(4.0)
-    for drawable in (part, part.packed()):
+    for drawable in (part, part.compressed()):
         fused = fuse_maps(GridSpec(CONFIG.resolution_m, 1, 1), [(drawable, SE2())], 4.0)
         np.testing.assert_array_equal(fused.values, direct.values)
         off = fused.spec.T_frame_grid.distance_to(direct.spec.T_frame_grid)

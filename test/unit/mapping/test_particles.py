@@ -29,10 +29,10 @@ def walked(num_steps, seed=0, num_particles=400):
     found.add_first(SE2(1.0, 2.0, 0.1), np.zeros((3, 3)))
     sections = [Section()]
     for _ in range(num_steps):
-        found.settle(sections)
+        found.close_loops(sections)
         found.add_next(STEP, COVARIANCE)
         sections.append(Section())
-    found.settle(sections)
+    found.close_loops(sections)
     return found
 
 

@@ -29,10 +29,10 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Values of an occupancy map: -1 unknown, else the probability of being occupied in percent."""
 
 UNITS_PER_NAT = 1000.0
-"""Evidence is summed in integers of a thousandth of a nat: the same in any order."""
+"""Log-odds are summed in integers of a thousandth of a nat: the same in any order."""
 
 UNSEEN = np.int16(-32768)
-"""Instead of evidence: nothing was observed."""
+"""Instead of log-odds: nothing was observed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class OccupancyMap:
         return self.values >= 0
 
     def units(self) -> NDArray[np.int16]:
-        """Evidence (R, C) in units of `UNITS_PER_NAT`, `UNSEEN` where unknown.
+        """Log-odds (R, C) in units of `UNITS_PER_NAT`, `UNSEEN` where unknown.
 
         0 and 100 count as half a percent from certainty.
         """

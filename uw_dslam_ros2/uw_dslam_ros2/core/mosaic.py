@@ -1,4 +1,4 @@
-"""Evidence of many grids at their poses, summed on one lattice.
+"""Log-odds of many grids at their poses, summed on one lattice.
 
 Log-odds are added as whole numbers, so that the sum does not depend on the order: adding a grid
 and taking it away again leaves the same bytes, and so does any order of arrival.
@@ -33,7 +33,7 @@ class Drawable(Protocol):
         """Where it lies in its own frame."""
 
     def units(self) -> NDArray[np.int16]:
-        """Evidence (R, C) in units of `UNITS_PER_NAT`; `UNSEEN` where nothing was observed."""
+        """Log-odds (R, C) in units of `UNITS_PER_NAT`; `UNSEEN` where nothing was observed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class _Layers:
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """Cells with evidence."""
+        """Cells that somebody observed."""
         return (self.num_occupied > 0) | (self.num_free > 0)
 
 
@@ -155,7 +155,7 @@ class Mosaic:
         return changed
 
     def window(self) -> Window | None:
-        """Rectangle around all evidence."""
+        """Rectangle around all that was observed."""
         windows = [held.window for held in self._placed.values() if held.window is not None]
         return functools.reduce(Window.union, windows) if windows else None
 
@@ -166,7 +166,7 @@ class Mosaic:
         return GridSpec(resolution_m, *window.shape, self._lattice.T_frame_grid @ corner)
 
     def occupancy(self, log_odds_max: float) -> OccupancyMap | None:
-        """Everything, in percent of log-odds cut at a limit; None without evidence."""
+        """Everything, in percent of log-odds cut at a limit; None where nothing was observed."""
         window = self.window()
         if window is None:
             return None

@@ -43,7 +43,7 @@ class SubmapEstimator(Protocol):
     def add_next(self, T_previous_new: SE2, covariance: FloatArray) -> None:
         """Append a submap by odometry; covariance (3, 3) in the previous submap's frame."""
 
-    def settle(self, sections: list[ClosedSection]) -> None:
+    def close_loops(self, sections: list[ClosedSection]) -> None:
         """The newest submap has closed: look where its echoes were seen before."""
 
 
@@ -54,7 +54,7 @@ class _Graph(SubmapGraph):
         super().__init__()
         self._config = config
 
-    def settle(self, sections: list[ClosedSection]) -> None:
+    def close_loops(self, sections: list[ClosedSection]) -> None:
         """Look for loops of the newest submap, if that is asked for."""
         if self._config.estimator == "scan_matching" and self._config.loop.is_enabled:
             find_loops(self, sections, self._config)

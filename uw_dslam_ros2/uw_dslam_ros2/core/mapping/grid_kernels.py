@@ -1,6 +1,6 @@
 """Compiled loops of occupancy mapping.
 
-Evidence is an integer, so that sums do not depend on order.
+Log-odds are integers, so that sums do not depend on order.
 """
 
 from __future__ import annotations
@@ -132,14 +132,14 @@ def _water_window(limit, sonar_x, sonar_y, cos, sin):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True)
 def _add_water(  # type: ignore[no-untyped-def]
-    evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
+    log_odds, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
     limit, free,
 ):  # fmt: skip
     """Take `free` from every cell nearer than its direction's `limit` (a squared range).
 
     Runs of cells are decided by their ends where possible; the others cell by cell.
     """
-    num_rows, num_cols = evidence.shape
+    num_rows, num_cols = log_odds.shape
     num_directions = limit.shape[0]
     reach, low_x, high_x, low_y, high_y = _water_window(limit, sonar_x, sonar_y, cos, sin)
     if reach <= 0.0:
@@ -170,7 +170,7 @@ def _add_water(  # type: ignore[no-untyped-def]
                 continue
             if state == 1:
                 # Views counted from zero: the compiler then writes many cells at a time.
-                water, seen = evidence[row, start : stop + 1], observed[row, start : stop + 1]
+                water, seen = log_odds[row, start : stop + 1], observed[row, start : stop + 1]
                 for i in range(water.shape[0]):
                     water[i] -= free
                 for i in range(seen.shape[0]):
@@ -180,7 +180,7 @@ def _add_water(  # type: ignore[no-untyped-def]
                     dx = (origin_col + col + 0.5) * resolution - sonar_x
                     slot = _slot(cos * dx + sin * dy, -sin * dx + cos * dy, num_directions)
                     if dx * dx + dy * dy < limit[slot]:
-                        evidence[row, col] -= free
+                        log_odds[row, col] -= free
                         observed[row, col] = True
             start = stop + 1
             if (start - c0) % _LONG_RUN == 0:
@@ -189,25 +189,25 @@ def _add_water(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def add_ping(  # type: ignore[no-untyped-def]
-    evidence, observed, echo, origin_row, origin_col, resolution,
+    log_odds, observed, echo, origin_row, origin_col, resolution,
     sonar_x, sonar_y, sonar_yaw,
     points, weight, sigma_range, beamwidth, max_spread,
     table, free_range, hit, free,
 ):  # fmt: skip
-    """Add one ping's evidence: at most one contribution to each cell, echo before water.
+    """Add one ping's log-odds: at most one contribution to each cell, echo before water.
 
     Points (N, 2) are in the sonar's frame; cell (0, 0) has its outer corner at `origin` cells from
     the frame's zero. Cells outside the grid are left out. `echo` (R, C) int16 is scratch: zeros
     in, zeros out; making it anew for each ping would cost more than the ping.
     """
-    num_rows, num_cols = evidence.shape
+    num_rows, num_cols = log_odds.shape
     cos, sin = np.cos(sonar_yaw), np.sin(sonar_yaw)
     limit = np.full(table.shape[0], -1.0)
     for k in range(table.shape[0]):
         if table[k] >= 0:
             limit[k] = free_range[table[k]] * free_range[table[k]]
     _add_water(
-        evidence, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
+        log_odds, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
         limit, free,
     )  # fmt: skip
     count = points.shape[0]
@@ -253,14 +253,14 @@ def add_ping(  # type: ignore[no-untyped-def]
                     wy = (origin_row + row + 0.5) * resolution - sonar_y
                     slot = _slot(cos * wx + sin * wy, -sin * wx + cos * wy, limit.shape[0])
                     if wx * wx + wy * wy < limit[slot]:
-                        evidence[row, col] += free
+                        log_odds[row, col] += free
                     observed[row, col] = True
                     if num_touched == touched_rows.shape[0]:
                         touched_rows = np.concatenate((touched_rows, np.empty_like(touched_rows)))
                         touched_cols = np.concatenate((touched_cols, np.empty_like(touched_cols)))
                     touched_rows[num_touched], touched_cols[num_touched] = row, col
                     num_touched += 1
-                evidence[row, col] += value - before
+                log_odds[row, col] += value - before
                 echo[row, col] = value
     for k in range(num_touched):
         echo[touched_rows[k], touched_cols[k]] = 0

@@ -90,8 +90,8 @@ class LoopCase:
         """What the engine says."""
         log_odds_max = self.config.occupancy.log_odds_max
         return register_grids(
-            self.source.evidence.unpacked().to_occupancy(log_odds_max),
-            self.target.evidence.unpacked().to_occupancy(log_odds_max),
+            self.source.grid.decompressed().to_occupancy(log_odds_max),
+            self.target.grid.decompressed().to_occupancy(log_odds_max),
             self.config.loop.registration,
             prior=self.window,
         )
@@ -116,9 +116,9 @@ class LoopCase:
     @cached_property
     def conflict(self) -> float:
         """Share of either submap's echoes on free water of the other, where the matcher says."""
-        there = conflict(self.target.evidence, self.source.points, self.guess.T_target_source)
+        there = conflict(self.target.grid, self.source.points, self.guess.T_target_source)
         back = self.guess.T_target_source.inverse()
-        return max(there, conflict(self.source.evidence, self.target.points, back))
+        return max(there, conflict(self.source.grid, self.target.points, back))
 
     @cached_property
     def match(self) -> ScanMatch:

@@ -23,7 +23,7 @@ from uw_dslam_ros2.core.mapping.grid_kernels import NUM_DIRECTIONS, add_ping, be
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import Detections
 
-__all__ = ["GrowingGrid", "PackedEvidence", "SparseEvidence"]
+__all__ = ["CompressedGrid", "GrowingGrid", "LogOddsGrid"]
 
 _MAX_SPREAD_M = 0.5
 """Largest half width of an echo across the beam: far off, a wide one would paint whole arcs."""
@@ -33,13 +33,13 @@ _TILE = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SparseEvidence:
-    """A closed grid: integer evidence (R, C) and mask.
+class LogOddsGrid:
+    """A closed grid: integer log-odds (R, C) and mask.
 
     Its cell (0, 0) lies at lattice cell `row`, `col`.
     """
 
-    evidence: NDArray[np.int32]
+    log_odds: NDArray[np.int32]
     observed: NDArray[np.bool_]
     row: int
     col: int
@@ -48,24 +48,24 @@ class SparseEvidence:
     @property
     def spec(self) -> GridSpec:
         """Where it lies."""
-        return _spec_of(self.evidence.shape, self.row, self.col, self.resolution_m)
+        return _spec_of(self.log_odds.shape, self.row, self.col, self.resolution_m)
 
     def units(self) -> NDArray[np.int16]:
-        """Evidence (R, C), cut at 32 nats; `UNSEEN` where nothing was observed."""
-        return np.where(self.observed, np.clip(self.evidence, -32767, 32767), UNSEEN).astype(
+        """Log-odds (R, C), cut at 32 nats; `UNSEEN` where nothing was observed."""
+        return np.where(self.observed, np.clip(self.log_odds, -32767, 32767), UNSEEN).astype(
             np.int16
         )
 
-    def trimmed(self) -> SparseEvidence:
+    def trimmed(self) -> LogOddsGrid:
         """A copy of the observed part, at least one cell."""
         rows = np.flatnonzero(self.observed.any(axis=1))
         cols = np.flatnonzero(self.observed.any(axis=0))
         if len(rows) == 0:
             nothing = np.zeros((1, 1), np.int32), np.zeros((1, 1), np.bool_)
-            return SparseEvidence(*nothing, 0, 0, self.resolution_m)
+            return LogOddsGrid(*nothing, 0, 0, self.resolution_m)
         window = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
-        return SparseEvidence(
-            self.evidence[window].copy(),
+        return LogOddsGrid(
+            self.log_odds[window].copy(),
             self.observed[window].copy(),
             self.row + int(rows[0]),
             self.col + int(cols[0]),
@@ -76,18 +76,18 @@ class SparseEvidence:
         """Probability in percent."""
         table = percent_table(log_odds_max)
         limit = len(table) // 2
-        values = table[np.clip(self.evidence, -limit, limit) + limit]
+        values = table[np.clip(self.log_odds, -limit, limit) + limit]
         return OccupancyMap(self.spec, np.where(self.observed, values, np.int8(UNKNOWN)))
 
-    def packed(self) -> PackedEvidence:
-        """Compressed for keeping; evidence is cut at 32 nats."""
+    def compressed(self) -> CompressedGrid:
+        """Compressed for keeping; log-odds are cut at 32 nats."""
         data = zlib.compress(self.units().tobytes(), 1)
-        return PackedEvidence(data, self.evidence.shape, self.row, self.col, self.resolution_m)
+        return CompressedGrid(data, self.log_odds.shape, self.row, self.col, self.resolution_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PackedEvidence:
-    """`SparseEvidence` at a twentieth of its size."""
+class CompressedGrid:
+    """`LogOddsGrid` at a twentieth of its size."""
 
     data: bytes
     shape: tuple[int, int]
@@ -101,15 +101,15 @@ class PackedEvidence:
         return _spec_of(self.shape, self.row, self.col, self.resolution_m)
 
     def units(self) -> NDArray[np.int16]:
-        """Evidence (R, C); `UNSEEN` where nothing was observed."""
+        """Log-odds (R, C); `UNSEEN` where nothing was observed."""
         return np.frombuffer(zlib.decompress(self.data), np.int16).reshape(self.shape).copy()
 
-    def unpacked(self) -> SparseEvidence:
+    def decompressed(self) -> LogOddsGrid:
         """The grid again."""
         units = self.units()
         observed = units != UNSEEN
-        evidence = np.where(observed, units, 0).astype(np.int32)
-        return SparseEvidence(evidence, observed, self.row, self.col, self.resolution_m)
+        log_odds = np.where(observed, units, 0).astype(np.int32)
+        return LogOddsGrid(log_odds, observed, self.row, self.col, self.resolution_m)
 
 
 def _spec_of(shape: tuple[int, int], row: int, col: int, resolution_m: float) -> GridSpec:
@@ -117,7 +117,7 @@ def _spec_of(shape: tuple[int, int], row: int, col: int, resolution_m: float) ->
 
 
 class GrowingGrid:
-    """Evidence on a lattice through the frame's zero.
+    """Log-odds on a lattice through the frame's zero.
 
     It grows by whole tiles, so cells never move by fractions.
     """
@@ -125,7 +125,7 @@ class GrowingGrid:
     def __init__(self, config: OccupancyConfig = OccupancyConfig()) -> None:  # noqa: B008 (frozen)
         self._config = config
         self._row, self._col = 0, 0
-        self._evidence = np.zeros((0, 0), np.int32)
+        self._log_odds = np.zeros((0, 0), np.int32)
         self._observed = np.zeros((0, 0), np.bool_)
         self._scratch = np.zeros((0, 0), np.int16)
         self.num_pings = 0
@@ -140,7 +140,7 @@ class GrowingGrid:
         self._grow_for(detections, T_frame_sonar, float(free_range.max(initial=0.0)))
         beams = beam_table(detections.bearing_rad, 0.75 * detections.beamwidth_rad, NUM_DIRECTIONS)
         add_ping(
-            self._evidence, self._observed, self._scratch, self._row, self._col,
+            self._log_odds, self._observed, self._scratch, self._row, self._col,
             config.resolution_m, T_frame_sonar.x, T_frame_sonar.y, T_frame_sonar.yaw,
             detections.points, detections.weight,
             detections.range_sigma_m, detections.beamwidth_rad, _MAX_SPREAD_M,
@@ -149,10 +149,10 @@ class GrowingGrid:
         )  # fmt: skip
         self.num_pings += 1
 
-    def trimmed(self) -> SparseEvidence:
+    def trimmed(self) -> LogOddsGrid:
         """The observed part, at least one cell."""
         resolution_m = self._config.resolution_m
-        grid = SparseEvidence(self._evidence, self._observed, self._row, self._col, resolution_m)
+        grid = LogOddsGrid(self._log_odds, self._observed, self._row, self._col, resolution_m)
         return grid.trimmed()
 
     def _grow_for(self, detections: Detections, T_frame_sonar: SE2, reach_m: float) -> None:
@@ -168,8 +168,8 @@ class GrowingGrid:
             )
         first = np.floor(low / config.resolution_m).astype(np.int64)[::-1]
         last = np.floor(high / config.resolution_m).astype(np.int64)[::-1]
-        num_rows, num_cols = self._evidence.shape
-        if self._evidence.size:
+        num_rows, num_cols = self._log_odds.shape
+        if self._log_odds.size:
             old_last = (self._row + num_rows - 1, self._col + num_cols - 1)
             first = np.minimum(first, (self._row, self._col))
             last = np.maximum(last, old_last)
@@ -180,12 +180,12 @@ class GrowingGrid:
         )
         if (row, col, rows, cols) == (self._row, self._col, num_rows, num_cols):
             return
-        evidence, observed = np.zeros((rows, cols), np.int32), np.zeros((rows, cols), np.bool_)
-        if self._evidence.size:
+        log_odds, observed = np.zeros((rows, cols), np.int32), np.zeros((rows, cols), np.bool_)
+        if self._log_odds.size:
             window = (
                 slice(self._row - row, self._row - row + num_rows),
                 slice(self._col - col, self._col - col + num_cols),
             )
-            evidence[window], observed[window] = self._evidence, self._observed
-        self._row, self._col, self._evidence, self._observed = row, col, evidence, observed
+            log_odds[window], observed[window] = self._log_odds, self._observed
+        self._row, self._col, self._log_odds, self._observed = row, col, log_odds, observed
         self._scratch = np.zeros((rows, cols), np.int16)

@@ -17,7 +17,7 @@ from uw_dslam_ros2.core.mapping.loop_verdict import (
 )
 from uw_dslam_ros2.core.mapping.loops import MIN_POINTS, nearby
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
-from uw_dslam_ros2.core.mapping.occupancy import SparseEvidence
+from uw_dslam_ros2.core.mapping.occupancy import LogOddsGrid
 from uw_dslam_ros2.core.mapping.rivals import conflict
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.pose_graph import compose_covariance
@@ -101,7 +101,7 @@ class ParticleFilter:
         self._histories = np.concatenate([self._histories, moved[:, None]], axis=1)
         self._step = T_previous_new, covariance + _FLOOR
 
-    def settle(self, sections: list[ClosedSection]) -> None:
+    def close_loops(self, sections: list[ClosedSection]) -> None:
         """Draw the newest submap's pose: by odometry, and by its echoes where others saw them."""
         if self._step is None:
             return
@@ -113,7 +113,7 @@ class ParticleFilter:
         targets = self._candidates(sections)
         num_matched = 0
         if targets:
-            grids = {i: sections[i].evidence.unpacked() for i in [*targets, len(sections) - 1]}
+            grids = {i: sections[i].grid.decompressed() for i in [*targets, len(sections) - 1]}
             known: dict[bytes, tuple[FloatArray, FloatArray, float] | None] = {}
             for i in range(count):
                 seen = self._relative(i, targets)
@@ -153,7 +153,7 @@ class ParticleFilter:
     def _improved(
         self,
         sections: list[ClosedSection],
-        grids: dict[int, SparseEvidence],
+        grids: dict[int, LogOddsGrid],
         targets: list[int],
         seen: FloatArray,
         step: SE2,

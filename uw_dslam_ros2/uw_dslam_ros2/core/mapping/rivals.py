@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import UNITS_PER_NAT
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points
-from uw_dslam_ros2.core.mapping.occupancy import PackedEvidence, SparseEvidence
+from uw_dslam_ros2.core.mapping.occupancy import CompressedGrid, LogOddsGrid
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -29,16 +29,14 @@ _YAW_RAD = 0.03
 _ANYWHERE_M2 = 1e8
 
 
-def conflict(
-    evidence: PackedEvidence | SparseEvidence, points: FloatArray, T_grid_points: SE2
-) -> float:
+def conflict(seen: CompressedGrid | LogOddsGrid, points: FloatArray, T_grid_points: SE2) -> float:
     """Share of the points (N, 2) that fall on surely free water of a grid.
 
     Who asks often unpacks the grid first.
     """
     if len(points) == 0:
         return 0.0
-    grid = evidence.unpacked() if isinstance(evidence, PackedEvidence) else evidence
+    grid = seen.decompressed() if isinstance(seen, CompressedGrid) else seen
     return float(_on_water(grid, points, T_grid_points).sum()) / len(points)
 
 
@@ -60,7 +58,7 @@ def rivals(
     stride = max(1, -(-len(source.points) // _MAX_POINTS))
     points = source.points[::stride]
     field = LikelihoodField(target.points, target.weight, sigma_m)
-    grid = target.evidence.unpacked()
+    grid = target.grid.decompressed()
     best_met, best_against = _agreement(field, grid, points, T_target_source)
     least_met = _LEAST_SHARE * best_met
     least_quality = _quality(best_met, best_against) - _SLACK
@@ -140,7 +138,7 @@ def _quality(met: int, against: int) -> float:
 
 
 def _agreement(
-    field: LikelihoodField, grid: SparseEvidence, points: FloatArray, T_grid_points: SE2
+    field: LikelihoodField, grid: LogOddsGrid, points: FloatArray, T_grid_points: SE2
 ) -> tuple[int, int]:
     """How many points meet echoes, and how many of the others are where the target has looked."""
     meets = field.values_at(T_grid_points.apply(points)) > _MEETS
@@ -148,20 +146,20 @@ def _agreement(
     return int(meets.sum()), int((is_seen & ~meets).sum())
 
 
-def _on_water(grid: SparseEvidence, points: FloatArray, T_grid_points: SE2) -> NDArray[np.bool_]:
-    evidence, is_seen = _looked_up(grid, points, T_grid_points)
-    return is_seen & (evidence < -_SURELY_FREE_NATS * UNITS_PER_NAT)
+def _on_water(grid: LogOddsGrid, points: FloatArray, T_grid_points: SE2) -> NDArray[np.bool_]:
+    log_odds, is_seen = _looked_up(grid, points, T_grid_points)
+    return is_seen & (log_odds < -_SURELY_FREE_NATS * UNITS_PER_NAT)
 
 
 def _looked_up(
-    grid: SparseEvidence, points: FloatArray, T_grid_points: SE2
+    grid: LogOddsGrid, points: FloatArray, T_grid_points: SE2
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Evidence (N,) under the points, and whether their cells were observed (N,)."""
+    """Log-odds (N,) under the points, and whether their cells were observed (N,)."""
     cells = np.floor(T_grid_points.apply(points) / grid.resolution_m).astype(np.int64)
     rows, cols = cells[:, 1] - grid.row, cells[:, 0] - grid.col
     inside = (rows >= 0) & (cols >= 0)
-    inside &= (rows < grid.evidence.shape[0]) & (cols < grid.evidence.shape[1])
-    evidence, is_seen = np.zeros(len(points), np.int32), np.zeros(len(points), np.bool_)
-    evidence[inside] = grid.evidence[rows[inside], cols[inside]]
+    inside &= (rows < grid.log_odds.shape[0]) & (cols < grid.log_odds.shape[1])
+    log_odds, is_seen = np.zeros(len(points), np.int32), np.zeros(len(points), np.bool_)
+    log_odds[inside] = grid.log_odds[rows[inside], cols[inside]]
     is_seen[inside] = grid.observed[rows[inside], cols[inside]]
-    return evidence, is_seen
+    return log_odds, is_seen

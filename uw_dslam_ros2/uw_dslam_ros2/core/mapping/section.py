@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import SubmapConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.matcher import thin
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid, PackedEvidence
+from uw_dslam_ros2.core.mapping.occupancy import CompressedGrid, GrowingGrid
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import Detections
 from uw_dslam_ros2.core.submap import Submap
@@ -31,7 +31,7 @@ class ClosedSection:
 
     sequence: int
     stamp_ns: int
-    evidence: PackedEvidence
+    grid: CompressedGrid
     points: FloatArray
     weight: FloatArray
     trajectory: FloatArray
@@ -63,7 +63,7 @@ class ClosedSection:
             self.stamp_ns,
             T_odom_submap,
             self.covariance,
-            self.evidence.unpacked().to_occupancy(log_odds_max),
+            self.grid.decompressed().to_occupancy(log_odds_max),
             self.points,
             self.trajectory,
             self.stamps_ns,
@@ -132,7 +132,7 @@ class OpenSection:
         return ClosedSection(
             self.sequence,
             self._stamps_ns[-1],
-            self.grid.trimmed().packed(),
+            self.grid.trimmed().compressed(),
             points,
             weight,
             self.poses,

@@ -223,7 +223,7 @@ class VehicleMapper:
         for index, section in enumerate(self._closed):
             pose = section.T_odom_issued
             if mosaic.version_of(index) != pose:
-                mosaic.put(index, pose, section.evidence, pose)
+                mosaic.put(index, pose, section.grid, pose)
         if self._open is not None:
             mosaic.put(newest, None, self._open.grid.trimmed(), self._estimator.poses[newest])
         occupancy = mosaic.occupancy(self._config.occupancy.log_odds_max)
@@ -365,7 +365,7 @@ class VehicleMapper:
         section = self._open.close(poses[-1], drift)
         self._closed.append(section)
         self._open = None
-        self._estimator.settle(self._closed)
+        self._estimator.close_loops(self._closed)
         return self._issue(new=section)
 
     def _issue(self, new: ClosedSection | None = None) -> list[Submap]:

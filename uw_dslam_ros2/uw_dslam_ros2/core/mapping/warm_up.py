@@ -20,6 +20,6 @@ def warm_up() -> None:
     points = np.column_stack([np.full(9, 3.0), np.linspace(-1.0, 1.0, 9)])
     grid = GrowingGrid(config.occupancy)
     grid.add(detections_from_points(0, points), SE2())
-    fuse_maps(grid.trimmed().spec, [(grid.trimmed().packed(), SE2(0.1, 0.0, 0.1))], 4.0)
+    fuse_maps(grid.trimmed().spec, [(grid.trimmed().compressed(), SE2(0.1, 0.0, 0.1))], 4.0)
     field = LikelihoodField(points, np.ones(9), 0.2)
     match_points([field], points, np.ones(9), Prior(SE2(), np.eye(3) * 0.01), (0.2, 0.2, 0.1), 0.1)
