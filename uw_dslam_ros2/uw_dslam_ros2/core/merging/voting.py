@@ -74,23 +74,26 @@ def weigh(
     odds = (1.0 - _PASS) ** (num_checks - sum(votes[i].prior is not None for i in clique))
     for place, index in enumerate(clique):
         vote = votes[index]
-        chances = {
-            other: _chance(edges, index, other, vote, source, target, inlier_probability)
+        coincidences = {
+            other: _coincidence(edges, index, other, vote, source, target, inlier_probability)
             for other in clique
             if other != index
         }
         lacking = 1.0 / max(vote.constraint.probability, 1e-9) - 1.0
-        if vote.is_accepted or lacking * min(chances.values(), default=1.0) <= 1.0 / ENOUGH_ODDS:
+        if (
+            vote.is_accepted
+            or lacking * min(coincidences.values(), default=1.0) <= 1.0 / ENOUGH_ODDS
+        ):
             believed.append(vote.constraint)
         if place > 0 and vote.prior is not None:
-            odds *= _PASS / min(chances[earlier] for earlier in clique[:place])
+            odds *= _PASS / min(coincidences[earlier] for earlier in clique[:place])
     # Without an accepted answer among them, agreement has to be beyond doubt.
     if not has_accepted and odds < _ODDS_BEYOND_DOUBT:
         return [], 0.0
     return believed, odds
 
 
-def _chance(
+def _coincidence(
     edges: Sequence[Edge],
     index: int,
     other: int,
