@@ -35,8 +35,8 @@ def test_the_python_example_runs_as_it_stands(capsys) -> None:
     result, expected = variables["result"], variables["T_target_source"]
     assert capsys.readouterr().out.startswith("ACCEPTED ")
     distance_m, angle_rad = result.T_target_source.distance_to(expected)
-    assert distance_m < 0.05
-    assert angle_rad < 0.01
+    assert distance_m < 0.015
+    assert angle_rad < 0.001
 
 
 def test_commands_exist() -> None:

@@ -76,9 +76,9 @@ def test_outliers_writes_trials_that_agree_with_its_summary(tmp_path, capsys):
         assert len(own) == 2
         assert float(row["success"]) == sum(int(t["success"]) for t in own) / 2
     # Without noise the limit is exact.
-    for trial in trials:
-        if trial["method"] == "true pairs" and trial["noise_m"] == "0.0":
-            assert float(trial["error_deg"]) < 1e-9
+    exact = [t for t in trials if t["method"] == "true pairs" and t["noise_m"] == "0.0"]
+    assert len(exact) == 3 * 2
+    assert all(float(trial["error_deg"]) < 1e-9 for trial in exact)
     assert (tmp_path / "figure4.png").exists()
     assert "the paper" in capsys.readouterr().out
 
@@ -105,7 +105,7 @@ def test_nnde_registers_scans_of_the_recording(tmp_path, capsys):
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * 4
     engine = [float(row["error_deg"]) for row in rows if row["stage"] == "engine"]
-    assert sorted(engine)[1] < 3.0  # the median pair
+    assert sorted(engine)[1] < 0.5  # the median pair; 0.1 degrees were seen
     assert "second registration" in capsys.readouterr().out
 
 
@@ -116,10 +116,7 @@ def test_sigma_compares_fixed_kernels_with_the_engine(tmp_path, capsys, monkeypa
     with (tmp_path / "sigma.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * (2 + 1 + 1)  # fixed kernels, the paper's, the engine
-    assert [row["is_paper"] for row in rows].count("1") == 2
-    for row in rows:
-        if row["is_paper"] == "1":
-            assert float(row["sigma_m"]) == pytest.approx(0.1)
+    assert [float(row["sigma_m"]) for row in rows if row["is_paper"] == "1"] == [0.1, 0.1]
     assert "engine as it is" in capsys.readouterr().out
 
 
@@ -140,8 +137,8 @@ def test_verdict_prints_models_that_can_be_pasted(tmp_path, capsys, monkeypatch)
         rows = _rows(tmp_path / name)
         assert {row["noise"] for row in rows} == {"clean", "noisy", "hard"}
         clean = [r for r in rows if r["noise"] == "clean" and r["is_matching"] == "True"]
-        assert all(row["is_right"] == "True" for row in clean)
-        assert all(r["is_right"] == "False" for r in rows if r["is_matching"] == "False")
+        assert {row["is_right"] for row in clean} == {"True"}
+        assert {r["is_right"] for r in rows if r["is_matching"] == "False"} == {"False"}
 
 
 def test_overlap_counts_what_it_accepts(tmp_path, capsys, monkeypatch):
@@ -150,11 +147,15 @@ def test_overlap_counts_what_it_accepts(tmp_path, capsys, monkeypatch):
     assert main(["overlap", "--out", str(tmp_path), *arguments]) == 0
     rows = _rows(tmp_path / "pairs.csv")
     assert sum(row["matching"] == "True" for row in rows) == 2
-    for row in rows:
-        if row["accepted"] == "True" and row["right"] == "True":
-            assert float(row["error_cells"]) < 6.0
-            assert float(row["nees"]) >= 0.0
-        assert 0.0 <= float(row["probability"]) <= 1.0
+    # Clean windows of one map that share 70 % of their walls: the easiest there is.
+    matching = [row for row in rows if row["matching"] == "True"]
+    assert [(row["accepted"], row["right"]) for row in matching] == 2 * [("True", "True")]
+    for row in matching:
+        assert float(row["error_cells"]) < 0.3  # 0.08 cells were seen
+        assert 0.0 < float(row["nees"]) < 16.0  # one in a thousand is above
+    others = [row for row in rows if row["matching"] == "False"]
+    assert all(row["accepted"] == "False" for row in others)
+    assert all(float(row["probability"]) < 0.5 for row in others)
     assert "clean | 70%" in capsys.readouterr().out
     assert (tmp_path / "overlap.png").exists()
 
@@ -171,11 +172,12 @@ def test_field_scores_all_methods_on_the_same_pairs(tmp_path, capsys, monkeypatc
     rows = _rows(tmp_path / "field.csv")
     assert {row["method"] for row in rows} == set(quick)
     assert len(rows) == len(quick)
-    for row in rows:
-        # Nothing is nearer to the map merged by the truth than a map merged within two cells.
-        if row["right"] == "True" and float(row["error_m"]) < 0.1:
-            wrong = [r for r in rows if r["answered"] == "True" and r["right"] == "False"]
-            assert all(float(row["mse"]) < float(r["mse"]) for r in wrong)
+    # Nothing is nearer to the map merged by the truth than a map merged within two cells.
+    near = [float(r["mse"]) for r in rows if r["right"] == "True" and float(r["error_m"]) < 0.1]
+    wrong = [float(r["mse"]) for r in rows if (r["answered"], r["right"]) == ("True", "False")]
+    assert len(near) >= 2
+    assert len(wrong) >= 1
+    assert max(near) < min(wrong)
     assert (tmp_path / "harbour_70.png").exists()
     assert "ORB + RANSAC" in capsys.readouterr().out
 

@@ -29,7 +29,7 @@ def test_lines_stay_and_specks_go():
     values[specks] = 100
     cells = clean_cells(_map(values))
     assert cells.wall[20, 8:52].all()
-    assert cells.wall[specks].mean() < 0.1
+    assert cells.wall[specks].mean() < 0.02  # none was seen
     assert cells.free[specks].mean() > 0.8
 
 

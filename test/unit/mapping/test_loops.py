@@ -69,23 +69,24 @@ def test_uneven_piers_close_a_loop(rng, along):
     answer = close(target, source, SE2(0.2, 1.3, 0.02) @ T_true)
     assert answer is not None
     distance, turn = answer[0].distance_to(T_true)
-    assert distance < 0.08
-    assert turn < 0.01
+    assert distance < 0.02  # 0.006 m and 0.0004 rad were seen
+    assert turn < 0.002
 
 
 @pytest.mark.parametrize("along", [1.0, 5.0])
-@pytest.mark.parametrize("off", [-SPACING, 0.0, SPACING])
-def test_of_periodic_piers_only_what_lies_across_is_believed(rng, along, off):
+def test_of_periodic_piers_only_what_lies_across_is_believed(rng, along):
     target, source, T_true = pair(PERIODIC, rng, along)
-    answer = close(target, source, SE2(0.0, off, 0.0) @ T_true)
-    if answer is None:
-        return
-    T_target_source, information = answer
-    # The quay runs along the target's y axis; where along it nothing but luck would have told.
-    sigma_across, sigma_along = 1.0 / np.sqrt(np.diag(information)[:2] + 1e-12)
-    assert sigma_along > SPACING
-    assert abs(T_target_source.x - T_true.x) < 4.0 * sigma_across + 0.05
-    assert abs(T_target_source.yaw - T_true.yaw) < 0.01
+    guesses = [SE2(0.0, off, 0.0) @ T_true for off in (-SPACING, 0.0, SPACING)]
+    # A guess may also be refused altogether.
+    answers = [answer for guess in guesses if (answer := close(target, source, guess))]
+    assert answers
+    for T_target_source, information in answers:
+        # The quay runs along the target's y axis; where along it nothing but luck would have told.
+        sigma_across, sigma_along = 1.0 / np.sqrt(np.diag(information)[:2] + 1e-12)
+        assert sigma_along > 10.0 * SPACING
+        assert 0.01 < sigma_across < 0.2
+        assert abs(T_target_source.x - T_true.x) < 0.02  # 0.005 m and 0.0002 rad were seen
+        assert abs(T_target_source.yaw - T_true.yaw) < 0.002
 
 
 def test_nothing_is_left_along_the_rivals_and_nothing_is_lost_across():

@@ -67,7 +67,7 @@ def test_a_single_match_is_not_surer_than_it_is_good():
         found = match(known, source)
         error = found.T_target_source.as_array()
         squares.append(error @ found.information @ error / 3.0)
-    assert np.mean(squares) < 1.0
+    assert np.mean(squares) < 0.02  # 0.006 was seen
 
 
 def test_information_grows_with_the_number_of_echoes():
@@ -82,13 +82,13 @@ def test_two_piers_alike_have_no_lead_and_one_has():
     two = np.vstack([pier, SE2(3.0, 0.0, 0.0).apply(pier)])
     ambiguous = match(two, pier, SE2(1.5, 0.0, 0.0), sigma=(1.0, 0.3, 0.05))
     clear = match(pier, pier, SE2(1.0, 0.0, 0.0), sigma=(1.0, 0.3, 0.05))
-    assert ambiguous.lead < 0.05
+    assert ambiguous.lead < 1e-3
     assert clear.lead > 0.5
 
 
 def test_elsewhere_there_is_no_overlap():
     found = match(corner(), SE2(40.0, 0.0, 0.0).apply(corner()))
-    assert found.overlap < 0.1
+    assert found.overlap == 0.0
 
 
 def test_field_is_the_kernel_density_of_thinned_points(rng):

@@ -54,7 +54,7 @@ def test_a_false_match_is_believed_as_the_paper_does():
     queue = filled(["auv_1", "auv_2"])
     answer_all(queue, KnowingMatcher(FLEET, wrong_share=1.0))
     assert {r.component for r in queue.submaps()} == {0}
-    assert FLEET.position_rmse_m(queue) > 1.0
+    assert FLEET.position_rmse_m(queue) > 5.0
 
 
 def test_a_withdrawn_vehicle_does_not_stop_the_others():

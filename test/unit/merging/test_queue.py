@@ -328,11 +328,11 @@ def test_an_edge_falls_out_when_others_show_that_it_is_false():
 
     queue = filled(sorted(fleet.submaps)[:2], fleet=fleet)
     answer_all(queue, matcher)
-    assert fleet.position_rmse_m(queue) > 1.0
+    assert fleet.position_rmse_m(queue) > 5.0  # 18 m were seen, and 0.04 m below
     for submap_id in sorted(fleet.submaps)[2:]:
         queue.add_submap(fleet.submaps[submap_id])
     answer_all(queue, matcher)
-    assert fleet.position_rmse_m(queue) < 0.5
+    assert fleet.position_rmse_m(queue) < 0.1
     outliers = [c for c in queue.constraints() if not c.is_inlier]
     assert {frozenset((c.source, c.target)) for c in outliers} == {wrong}
 
@@ -418,7 +418,7 @@ def test_what_a_false_edge_had_merged_leaves_nothing_behind():
     answer_all(whole, matcher)
     assert map_bytes(grown) == map_bytes(whole)
     assert grown.global_map().spec != false_spec
-    assert fleet.position_rmse_m(grown) < 0.5
+    assert fleet.position_rmse_m(grown) < 0.1
 
 
 def test_loops_are_measured_in_metres_and_radians():

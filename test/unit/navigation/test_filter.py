@@ -155,8 +155,8 @@ def test_too_late_by_its_kind_alone_is_counted_too():
     # A yaw comes before a velocity of its stamp, so at the oldest stamp that is kept it is late.
     for i in range(200):
         navigation.add_yaw(i * S // 10, 0.0)
-    assert navigation.num_late > 0
-    assert navigation.pose_at(20 * S)[0].distance_to(before)[0] < 0.5
+    assert navigation.num_late > 190  # all but those of the last half second
+    assert navigation.pose_at(20 * S)[0].distance_to(before) < (1e-9, 1e-9)
 
 
 def test_the_same_message_twice_is_still_a_valid_filter():
@@ -165,7 +165,9 @@ def test_the_same_message_twice_is_still_a_valid_filter():
         for _ in range(2):
             navigation.add_yaw(i * S // 10, 0.0)
             navigation.add_velocity(i * S // 10, (1.0, 0.0))
-    assert np.linalg.eigvalsh(navigation.pose_at(5 * S)[1])[0] >= 0.0
+    pose, covariance = navigation.pose_at(5 * S)
+    assert pose.distance_to(SE2(5.0, 0.0, 0.0)) < (1e-4, 1e-9)
+    assert np.linalg.eigvalsh(covariance)[0] >= 0.0
 
 
 def test_dropout_is_bridged_and_admitted():
@@ -199,7 +201,7 @@ def test_outliers_do_not_move_it():
     feed(dirty, with_outliers)
     assert dirty.num_outliers >= len(with_outliers) - len(events)
     (a, _), (b, _) = clean.pose_at(30 * S), dirty.pose_at(30 * S)
-    assert a.distance_to(b)[0] < 0.05
+    assert a.distance_to(b)[0] < 0.001  # 0.1 mm was seen
     assert np.hypot(*(b.as_array()[:2] - poses[-1, :2])) < 1.0
 
 

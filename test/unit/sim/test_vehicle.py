@@ -38,7 +38,7 @@ def integrate(yaw, velocity, dt, start):
 
 def test_velocities_integrate_to_the_positions(motion):
     track = integrate(motion.poses[:, 2], motion.velocity_m_s, 0.02, motion.poses[0, :2])
-    assert np.hypot(*(track - motion.poses[:, :2]).T).max() < 0.02
+    assert np.hypot(*(track - motion.poses[:, :2]).T).max() < 0.001
     turned = np.cumsum(motion.yaw_rate_rad_s) * 0.02
     assert np.abs(turned - (motion.poses[:, 2] - motion.poses[0, 2])).max() < 0.01
 
@@ -67,4 +67,4 @@ def test_the_bow_points_into_the_current():
     crab = drifting.poses[:, 2] - still.poses[:, 2]
     np.testing.assert_allclose(np.degrees(crab), -17.46, atol=0.01)
     track = integrate(drifting.poses[:, 2], drifting.velocity_m_s, 0.02, drifting.poses[0, :2])
-    assert np.hypot(*(track - drifting.poses[:, :2]).T).max() < 0.02
+    assert np.hypot(*(track - drifting.poses[:, :2]).T).max() < 0.001

@@ -75,18 +75,18 @@ def test_the_greatest_of_a_rotation_is_that_of_all_its_translations(shapes):
         assert _scores(problem, theta, np.array([lag]))[0] == pytest.approx(score, abs=1e-5)
 
 
-def test_peaks_of_a_window_are_the_best_in_it_and_apart():
+@pytest.mark.parametrize(("half_y", "num_peaks"), [(5.0, 4), (1.0, 2)])
+def test_peaks_of_a_window_are_the_best_in_it_and_apart(half_y, num_peaks):
     problem = _problem(*_SHAPES[0])
-    window = PoseWindow(np.array([0.3, 4.0, 5.0]), np.array([0.5, 3.5, 5.0]))
+    window = PoseWindow(np.array([0.3, 4.0, 5.0]), np.array([0.5, 3.5, half_y]))
     theta = 0.2
     peaks, _ = grid_landscape._Scan(problem).best(np.array([theta]), window)
-    lags = np.stack(np.meshgrid(np.arange(0, 9), np.arange(-1, 12)), axis=-1)
-    scores = _scores(problem, theta, lags.reshape(-1, 2)).reshape(13, 9)
-    for _, t_x, t_y, score in peaks[0]:
+    rows = np.arange(5 - int(half_y) - 1, 5 + int(half_y) + 2)
+    lags = np.stack(np.meshgrid(np.arange(0, 9), rows), axis=-1)
+    scores = _scores(problem, theta, lags.reshape(-1, 2)).reshape(len(rows), 9)
+    assert np.isneginf(peaks[0, num_peaks:, 3]).all()  # for those there is no room
+    for _, t_x, t_y, score in peaks[0, :num_peaks]:
         row, col = np.unravel_index(scores.argmax(), scores.shape)
-        if scores[row, col] == -np.inf:
-            assert score == -np.inf
-            continue
         assert score == pytest.approx(scores[row, col], abs=1e-5)
         np.testing.assert_array_equal([t_x, t_y], lags[row, col])
         scores[max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4] = -np.inf

@@ -29,8 +29,8 @@ def test_planted_motion_is_recovered(kind):
     cells, degrees = _errors(pair, result.T_target_source)
     assert result.verdict is Verdict.ACCEPTED, result.reason
     assert result.is_certified
-    assert cells < 2.0
-    assert degrees < 1.0
+    assert cells < 0.5  # 0.19 cells and 0.09 degrees were seen
+    assert degrees < 0.3
 
 
 def _coarser(occupancy: OccupancyMap) -> OccupancyMap:
@@ -109,7 +109,7 @@ def test_a_prior_finds_the_same_and_a_wrong_one_does_not(harbour):
     near = PriorWindow(SE2(truth.x + 0.5, truth.y - 0.5, truth.yaw + 0.1), 2.0, 0.3)
     result = register_grids(harbour.source, harbour.target, prior=near)
     assert result.is_accepted, result.reason
-    assert _errors(harbour, result.T_target_source)[0] < 2.0
+    assert _errors(harbour, result.T_target_source)[0] < 0.5
     far = PriorWindow(SE2(truth.x, truth.y, truth.yaw + 2.0), 2.0, 0.3)
     assert not register_grids(harbour.source, harbour.target, prior=far).is_accepted
 

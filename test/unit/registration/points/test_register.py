@@ -39,8 +39,8 @@ def test_a_planted_motion_is_found_and_proven(method, clutter, noise):
     result = register_point_sets(source, target, RegistrationConfig(method=method))
     translation, rotation = result.T_target_source.distance_to(PLANTED)
     assert result.verdict is Verdict.ACCEPTED, result.reason
-    assert translation < 0.002 + noise
-    assert rotation < math.radians(0.01) + noise
+    assert translation < 1e-6 + 0.4 * noise  # 0.24 and 0.07 times the noise were seen
+    assert rotation < 1e-6 + 0.15 * noise
     assert result.is_certified
     assert result.lower_bound <= result.upper_bound
     assert result.gap <= 0.03
@@ -75,7 +75,7 @@ def test_unrelated_sets_are_refused():
     for _ in range(5):
         result = register_point_sets(rng.uniform(-1, 1, (40, 2)), rng.uniform(-1, 1, (40, 2)))
         assert result.verdict is Verdict.IMPROBABLE, result.reason
-        assert result.probability < 0.95
+        assert result.probability < 0.3  # 0.1 was seen
 
 
 def test_a_symmetric_set_is_ambiguous_and_names_its_twin():
@@ -87,7 +87,7 @@ def test_a_symmetric_set_is_ambiguous_and_names_its_twin():
     twin = PLANTED @ SE2(0.0, 0.0, math.pi)
     poses = [result.T_target_source, result.rivals[0].T_target_source]
     for expected in (PLANTED, twin):
-        assert min(pose.distance_to(expected)[1] for pose in poses) < 0.01
+        assert min(pose.distance_to(expected)[1] for pose in poses) < 1e-6
     assert result.rivals[0].score > 0.9
 
 
@@ -151,7 +151,7 @@ def test_own_weights_and_deviations_are_used():
         source_sigma_m=rng.choice([0.02, 0.05], 25), target_sigma_m=rng.uniform(0.02, 0.05, 40),
     )  # fmt: skip
     assert result.is_accepted
-    assert result.T_target_source.distance_to(PLANTED)[0] < 0.01
+    assert result.T_target_source.distance_to(PLANTED) < (1e-6, 1e-6)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_walls_along_which_one_can_slide_are_ambiguous(segments, seed):
     rng = np.random.default_rng([13, seed])
     result = register_point_sets(walls(rng, segments), PLANTED.apply(walls(rng, segments)))
     assert result.verdict is Verdict.AMBIGUOUS, result.reason
-    assert result.probability <= 0.5
+    assert result.probability <= 0.1  # 0.0005 was seen
     assert result.rivals[0].score > 0.9
 
 
@@ -239,7 +239,7 @@ def test_a_room_with_a_corner_of_its_own_is_accepted():
     result = register_point_sets(walls(rng, room), PLANTED.apply(walls(rng, room)))
     assert result.is_accepted, result.reason
     translation, rotation = result.T_target_source.distance_to(PLANTED)
-    assert translation < 0.05
-    assert rotation < math.radians(1.0)
+    assert translation < 0.012  # 0.004 m and 0.04 degrees were seen
+    assert rotation < math.radians(0.15)
     # As wide as the error, and wider than that of as many independent points.
     assert result.covariance[0, 0] > 2.0 * 0.01**2 * 2.0 / len(walls(rng, room))

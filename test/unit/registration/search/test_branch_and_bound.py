@@ -70,8 +70,10 @@ def bound_box(problem, box, floor=-math.inf):
     return first, out[0], out[1]
 
 
-@pytest.mark.parametrize("shrink", [1.0, 0.2, 0.05, 0.01, 0.001])
-def test_bounds_hold_at_random_poses_of_random_boxes(shrink):
+@pytest.mark.parametrize(
+    ("shrink", "least"), [(1.0, 0), (0.2, 0), (0.05, 30), (0.01, 30), (0.001, 30)]
+)
+def test_bounds_hold_at_random_poses_of_random_boxes(shrink, least):
     rng = np.random.default_rng(10)
     tried = 0
     for terms in some_problems(rng):
@@ -88,7 +90,7 @@ def test_bounds_hold_at_random_poses_of_random_boxes(shrink):
             tried += math.isfinite(out[1])
             if math.isfinite(out[1]):
                 assert out[2] == pytest.approx(problem.value_at(middle)[0], abs=1e-9)
-    assert shrink > 0.1 or tried > 30  # the second-order bound was among them
+    assert tried >= least  # the second-order bound was among them
 
 
 def test_second_order_bound_converges_quadratically():
@@ -116,13 +118,10 @@ def test_gradient_and_second_derivatives_are_those_of_the_value():
             behind, behind_gradient, _ = problem.value_at(pose - step)
             scale = 1.0 + np.abs(gradient).max()
             assert (ahead - behind) / 2e-6 == pytest.approx(gradient @ direction, abs=1e-4 * scale)
-            # The spline's second derivative jumps at cell edges, which few of the steps cross.
+            # The spline's second derivative jumps at cell edges; none of these steps crosses one.
             change = (ahead_gradient - behind_gradient) / 2e-6
-            if not np.allclose(
-                change, hessian @ direction, atol=1e-3 * (1.0 + np.abs(hessian).max())
-            ):
-                around = [problem.value_at(pose + side * step)[2] for side in (-1.0, 1.0)]
-                assert not np.allclose(around[0], around[1], rtol=1e-3)
+            atol = 1e-3 * (1.0 + np.abs(hessian).max())
+            np.testing.assert_allclose(change, hessian @ direction, atol=atol)
 
 
 def exhaustive_best(problem, rng):
@@ -156,7 +155,7 @@ def test_a_planted_motion_is_found_at_huge_offsets():
     terms = [mixture_term(source, planted.apply(source))]
     outcome = search(terms)
     moved = outcome.T_target_source.apply(source)
-    assert np.abs(moved - planted.apply(source)).max() < 0.01
+    assert np.abs(moved - planted.apply(source)).max() < 1e-3  # 0.03 mm was seen
     assert outcome.status is Status.CERTIFIED
 
 
