@@ -60,11 +60,13 @@ def test_dead_stream_is_not_waited_for():
     assert drained(order) == ["a", "b"]
 
 
-def test_equal_stamps_keep_their_arrival():
+@pytest.mark.parametrize("names", [("dvl", "imu", "sonar"), ("sonar", "imu", "dvl")])
+def test_equal_stamps_leave_by_the_name_of_their_stream(names):
     order = StampOrder(hold_ns=0, jump_ns=FOREVER)
-    order.add("a", 5, "x")
-    order.add("b", 5, "y")
-    assert drained(order) == ["x", "y"]
+    for name in names:
+        order.add(name, 5, name)
+    order.add("dvl", 5, "dvl again")
+    assert drained(order) == ["dvl", "dvl again", "imu", "sonar"]
 
 
 def test_late_item_is_counted_and_leaves_at_once():

@@ -21,7 +21,7 @@ from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfi
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.bags import TransformEvent, TruthEvent, open_bag, read_events
-from uw_dslam_ros2.io.feeding import feed
+from uw_dslam_ros2.io.feeding import feed, in_stamp_order
 from uw_dslam_ros2.io.settings import SettingsFile
 
 __all__ = ["OfflineConfig", "VehicleSubmaps", "map_bag", "map_bags", "settle", "vehicle_of_bag"]
@@ -149,7 +149,7 @@ def map_bag(bag: Path, vehicle_id: str, config: VehicleMapperConfig) -> VehicleS
     base_frame = f"{vehicle_id}/base_link"
     newest: dict[int, Submap] = {}
     number = 0
-    for number, event in enumerate(read_events(bag), start=1):
+    for number, event in enumerate(in_stamp_order(read_events(bag)), start=1):
         if number % 200 == 0:
             _count(200)
         if isinstance(event, TransformEvent):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import heapq
 import math
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +21,31 @@ from uw_dslam_ros2.io.events import (
     VelocityEvent,
 )
 
-__all__ = ["SensorEvent", "feed"]
+__all__ = ["SensorEvent", "feed", "in_stamp_order"]
 
 SensorEvent = ImageEvent | ImuEvent | VelocityEvent | DepthEvent | ScanEvent | PointsEvent
+
+_PINGS = (ImageEvent, ScanEvent, PointsEvent)
+_HOLD_NS = 2_000_000_000
+
+
+def in_stamp_order[EventT](events: Iterable[EventT]) -> Iterator[EventT]:
+    """Bring a recording's messages, up to 2 s out of order, into that of their stamps.
+
+    Of equal stamps the pings come last. What is no sensor's message is passed on at once.
+    """
+    waiting: list[tuple[int, bool, int, EventT]] = []
+    newest_ns = 0
+    for number, event in enumerate(events):
+        if not isinstance(event, SensorEvent):
+            yield event
+            continue
+        newest_ns = max(newest_ns, event.stamp_ns)
+        heapq.heappush(waiting, (event.stamp_ns, isinstance(event, _PINGS), number, event))
+        while waiting[0][0] < newest_ns - _HOLD_NS:
+            yield heapq.heappop(waiting)[-1]
+    while waiting:
+        yield heapq.heappop(waiting)[-1]
 
 
 def feed(
@@ -47,15 +71,15 @@ def feed(
             return mapper.add_points(stamp_ns, event.points, planar_mount(T_base_sensor))
         case VelocityEvent():
             mount = planar_mount(T_base_sensor)
-            return mapper.add_velocity(stamp_ns, event.velocity_m_s, event.covariance, mount)
+            mapper.add_velocity(stamp_ns, event.velocity_m_s, event.covariance, mount)
         case ImuEvent():
-            return _feed_imu(mapper, event, planar_mount(T_base_sensor).yaw)
+            _feed_imu(mapper, event, planar_mount(T_base_sensor).yaw)
         case DepthEvent():
             mapper.add_depth(stamp_ns, event.depth_m)
     return []
 
 
-def _feed_imu(mapper: VehicleMapper, event: ImuEvent, mount_yaw_rad: float) -> list[Submap]:
+def _feed_imu(mapper: VehicleMapper, event: ImuEvent, mount_yaw_rad: float) -> None:
     yaw_rad = None if event.yaw_rad is None else event.yaw_rad - mount_yaw_rad
     sigma_rad = None if event.yaw_variance is None else math.sqrt(event.yaw_variance)
-    return mapper.add_imu(event.stamp_ns, yaw_rad, event.yaw_rate_rad_s, sigma_rad)
+    mapper.add_imu(event.stamp_ns, yaw_rad, event.yaw_rate_rad_s, sigma_rad)

@@ -35,6 +35,8 @@ REMOVED = {
     "sensor_queue": "it is always 5000",
     "jump_back_s": "it is always 1 s",
     "path_max_poses": "it is always 2000",
+    "mapper.settle_s": "a ping is mapped once all that is earlier has come",
+    "mapper.max_wait_s": "a ping is mapped once all that is earlier has come",
     "mapper.sonar.no_echo_free_share": "it is always 0.5",
     "mapper.occupancy.max_spread_m": "it is always 0.5 m",
     "mapper.occupancy.min_motion_m": "it is always 0.1 m",

@@ -43,7 +43,7 @@ from uw_dslam_ros2.core.metrics import (
 from uw_dslam_ros2.core.mounting import StaticFrames
 from uw_dslam_ros2.io.bags import TransformEvent, TruthEvent, read_events
 from uw_dslam_ros2.io.datasets.aracati2017 import SEGMENTS, read_aracati2017, write_bag
-from uw_dslam_ros2.io.feeding import feed
+from uw_dslam_ros2.io.feeding import feed, in_stamp_order
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.trajectories import read_tum
@@ -174,7 +174,7 @@ def _map(case: _Case, estimator: str) -> _Mapped:
     mapper = VehicleMapper(replace(case.config, estimator=estimator), "auv_1")
     frames = StaticFrames()
     start = time.process_time()
-    for event in read_events(case.bag):
+    for event in in_stamp_order(read_events(case.bag)):
         if isinstance(event, TransformEvent):
             frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
         elif not isinstance(event, TruthEvent):

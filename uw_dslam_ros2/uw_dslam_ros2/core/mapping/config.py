@@ -124,12 +124,3 @@ class VehicleMapperConfig(Config):
     match: MatchConfig = setting(MatchConfig())
     loop: LoopConfig = setting(LoopConfig())
     particles: ParticleConfig = setting(ParticleConfig())
-    settle_s: float = setting(
-        0.1,
-        0.0,
-        10.0,
-        "a ping waits until navigation is this far ahead, for messages out of order [s]",
-    )
-    max_wait_s: float = setting(
-        0.5, 0.0, 60.0, "a ping waits this long for its navigation messages [s]"
-    )

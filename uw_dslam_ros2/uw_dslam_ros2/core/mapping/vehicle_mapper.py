@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 
 import numpy as np
@@ -40,9 +39,10 @@ _MIN_OVERLAP = 0.3
 class VehicleMapper:
     """Maps one vehicle's surroundings; every input is a method call with a stamp in nanoseconds.
 
-    A ping waits until navigation has caught up with it (at most `VehicleMapperConfig.max_wait_s`
-    of sonar time), so the order in which messages arrive does not matter within that time. The
-    odom frame begins where the vehicle does.
+    Messages are to come in the order of their stamps, a ping after the navigation of its moment:
+    `io.feeding.in_stamp_order` and the mapper's node see to that. Navigation that is late all the
+    same is put where it belongs, for the pings that follow; a ping that is late, or earlier than
+    all navigation, is left out and counted. The odom frame begins where the vehicle does.
     """
 
     def __init__(self, config: VehicleMapperConfig, vehicle_id: str) -> None:
@@ -56,8 +56,6 @@ class VehicleMapper:
         self._mosaic = Mosaic(GridSpec(config.occupancy.resolution_m, 1, 1))
         self._closed: list[ClosedSection] = []
         self._open: OpenSection | None = None
-        self._pending: list[tuple[int, int, Detections, SE2]] = []
-        self._num_queued = 0
         self._last_ping_ns: int | None = None
         self._last_key: tuple[int, SE2] | None = None
         self._counts: dict[str, float | int | str] = {
@@ -75,7 +73,7 @@ class VehicleMapper:
         yaw_rad: float | None,
         yaw_rate_rad_s: float | None,
         yaw_sigma_rad: float | None = None,
-    ) -> list[Submap]:
+    ) -> None:
         """Yaw and yaw rate of base_link, counter-clockwise; None where not measured.
 
         Yaw may have an unknown constant offset.
@@ -84,7 +82,6 @@ class VehicleMapper:
             self._navigation.add_yaw_rate(stamp_ns, yaw_rate_rad_s)
         if yaw_rad is not None:
             self._navigation.add_yaw(stamp_ns, yaw_rad, yaw_sigma_rad)
-        return self._process_ready()
 
     def add_velocity(
         self,
@@ -92,12 +89,11 @@ class VehicleMapper:
         v_body_m_s: ArrayLike,
         covariance: ArrayLike | None = None,
         T_base_sensor: SE2 = SE2(),
-    ) -> list[Submap]:
+    ) -> None:
         """Velocity (2,) along the instrument's axes (forward, left) with covariance (2, 2)."""
         self._navigation.add_velocity(stamp_ns, v_body_m_s, covariance, T_base_sensor)
         if np.isfinite(np.asarray(v_body_m_s, dtype=np.float64)).all():
             self._velocity_ns = max(stamp_ns, self._velocity_ns or stamp_ns)
-        return self._process_ready()
 
     def add_depth(self, stamp_ns: int, depth_m: float) -> None:  # noqa: ARG002 (one form for all inputs)
         """Depth below the surface [m], positive down.
@@ -135,15 +131,11 @@ class VehicleMapper:
         )
 
     def finish(self) -> list[Submap]:
-        """Work off what waits, close the open submap, and settle the graph; no ping may follow."""
-        self._navigation.start()
-        issued = self._process_ready(flush=True)
-        if self._open is not None:
-            last_ns = int(self._open.stamps_ns[-1])
-            issued += self._close(self._navigation.relative_at(last_ns)[1])
-            self._open = None
-        newest: dict[int, Submap] = {submap.sequence: submap for submap in issued}
-        return [newest[sequence] for sequence in sorted(newest)]
+        """Close the open submap, and settle the graph; no ping may follow."""
+        if self._open is None:
+            return []
+        last_ns = int(self._open.stamps_ns[-1])
+        return self._close(self._navigation.relative_at(last_ns)[1])
 
     # --- results
     # ----------------
@@ -241,7 +233,6 @@ class VehicleMapper:
             "vehicle_id": self._vehicle_id,
             "estimator": self._config.estimator,
             **self._counts,
-            "num_pings_waiting": len(self._pending),
             "num_submaps": len(self._closed),
             "num_loops": self._estimator.num_loops,
             "num_loops_believed": self._estimator.num_loops_believed,
@@ -256,31 +247,12 @@ class VehicleMapper:
     # ----------------
 
     def _add(self, detections: Detections, T_base_sonar: SE2) -> list[Submap]:
-        heapq.heappush(
-            self._pending, (detections.stamp_ns, self._num_queued, detections, T_base_sonar)
-        )
-        self._num_queued += 1
-        return self._process_ready()
-
-    def _process_ready(self, flush: bool = False) -> list[Submap]:
-        issued: list[Submap] = []
-        while self._pending:
-            stamp_ns, _, detections, T_base_sonar = self._pending[0]
-            newest_ns = max(item[0] for item in self._pending)
-            navigation_ns = self._navigation.stamp_ns
-            settled_ns = stamp_ns + int(self._config.settle_s * 1e9)
-            is_ready = navigation_ns is not None and navigation_ns >= settled_ns
-            has_waited = newest_ns - stamp_ns > self._config.max_wait_s * 1e9
-            if not (is_ready or has_waited or flush):
-                break
-            heapq.heappop(self._pending)
-            is_old = self._last_ping_ns is not None and stamp_ns <= self._last_ping_ns
-            if navigation_ns is None or is_old:
-                self._count("num_pings_dropped")
-                continue
-            self._last_ping_ns = stamp_ns
-            issued += self._process(detections, T_base_sonar)
-        return issued
+        is_old = self._last_ping_ns is not None and detections.stamp_ns <= self._last_ping_ns
+        if is_old or not self._navigation.is_started:
+            self._count("num_pings_dropped")
+            return []
+        self._last_ping_ns = detections.stamp_ns
+        return self._process(detections, T_base_sonar)
 
     def _count(self, name: str) -> None:
         self._counts[name] = int(self._counts[name]) + 1

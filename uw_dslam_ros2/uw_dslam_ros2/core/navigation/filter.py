@@ -166,11 +166,6 @@ class NavigationFilter:
         )
         return {name: float(value) for name, value in zip(names, state[6:11], strict=True)}
 
-    def start(self) -> None:
-        """Begin with what has come so far, even without a yaw."""
-        if not self._records and self._early:
-            self._begin()
-
     def _is_valid(self, *values: float) -> bool:
         if all(math.isfinite(value) for value in values):
             return True

@@ -203,7 +203,7 @@ class SonarMapper(Node):
         """At the start, wait for the first message of every sensor that somebody sends."""
         for topic in self._streams:
             if self.count_publishers(topic):
-                self._order.expect(topic, stamp_ns)
+                self._order.expect(topic, stamp_ns - 1)  # its own may be of the same moment
 
     def _restart(self) -> None:
         self._order.clear()

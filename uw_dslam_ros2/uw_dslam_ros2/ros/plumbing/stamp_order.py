@@ -14,7 +14,8 @@ class StampOrder[ItemT]:
 
     Sensors have queues of their own, and an executor empties them in any order. What a mapper
     makes of its input must not depend on that. An item leaves when every stream that is alive has
-    come as far; a stream that is `hold_ns` behind the youngest item is not waited for.
+    come as far; a stream that is `hold_ns` behind the youngest item is not waited for. Of equal
+    stamps those leave first whose stream comes first by name: ``dvl``, ``imu``, then the pings.
 
     Parameters
     ----------
@@ -31,7 +32,7 @@ class StampOrder[ItemT]:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._heap: list[tuple[int, int, ItemT]] = []
+        self._heap: list[tuple[int, str, int, ItemT]] = []
         self._newest_of_stream: dict[str, int] = {}
         self._alive: set[str] = set()
         self._unheard: set[str] = set()
@@ -72,13 +73,13 @@ class StampOrder[ItemT]:
         self.advance(stream, stamp_ns)
         if self._released_ns is not None and stamp_ns < self._released_ns:
             self.num_late += 1
-        heapq.heappush(self._heap, (stamp_ns, next(self._ties), item))
+        heapq.heappush(self._heap, (stamp_ns, stream, next(self._ties), item))
 
     def peek(self) -> ItemT | None:
         """The item that may leave next, or None while an earlier one may come."""
         if not self._heap or not self._alive:
             return None
-        stamp_ns, _, item = self._heap[0]
+        stamp_ns, _, _, item = self._heap[0]
         return item if stamp_ns <= self._safe_ns() else None
 
     def _safe_ns(self) -> int:
@@ -95,6 +96,6 @@ class StampOrder[ItemT]:
 
     def pop(self) -> ItemT:
         """Take out the earliest item."""
-        stamp_ns, _, item = heapq.heappop(self._heap)
+        stamp_ns, _, _, item = heapq.heappop(self._heap)
         self._released_ns = max(self._released_ns or stamp_ns, stamp_ns)
         return item
