@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,8 +23,9 @@ SETTINGS = """
 
 @pytest.fixture(scope="module")
 def mission(tmp_path_factory: pytest.TempPathFactory) -> RecordedMission:
-    """Two vehicles that see nearly the same place."""
-    return simulate_mission(tmp_path_factory.mktemp("missions") / "tiny", tiny_mission_config(1))
+    """Two vehicles that see nearly the same place, for long enough to recognise it."""
+    config = replace(tiny_mission_config(1), duration_s=100.0)
+    return simulate_mission(tmp_path_factory.mktemp("missions") / "tiny", config)
 
 
 def _files(folder: Path) -> dict[str, bytes]:
@@ -42,7 +44,7 @@ def test_offline_merges_and_gives_the_same_bytes_again(mission, tmp_path, capsys
     common = ["--config", str(settings), "--no-report"]
     # The order in which the bags are named must not matter either.
     assert offline.main([*bags, "--out", str(tmp_path / "a"), *common]) == 0
-    assert "vehicles merged" in capsys.readouterr().out
+    assert "2 of 2 vehicles merged" in capsys.readouterr().out
     assert offline.main([*bags, "--out", str(tmp_path / "b"), *common]) == 0
     first, second = _files(tmp_path / "a"), _files(tmp_path / "b")
     assert first == second
@@ -50,8 +52,13 @@ def test_offline_merges_and_gives_the_same_bytes_again(mission, tmp_path, capsys
     report = json.loads(first["report.json"])
     assert report["num_vehicles"] == 2
     assert report["settings"]["mapper"]["auv_1"]["occupancy"]["resolution_m"] == 0.2
-    # The truth beside the bags was found, and the vehicles' own maps are straight.
-    assert max(report["scores"]["rmse_m_of_each_vehicle_alone"].values()) < 1.0
+    # The truth beside the bags was found. Seeds 1, 2 and 5 gave 0.06, 0.08 and 0.28 m, and 0.62,
+    # 0.53 and 0.50 of the walls.
+    scores = report["scores"]
+    assert set(scores["trajectory"]["rmse_m_by_vehicle"]) == {"auv_1", "auv_2"}
+    assert scores["trajectory"]["rmse_m"] < 0.2
+    assert max(scores["rmse_m_of_each_vehicle_alone"].values()) < 0.2
+    assert scores["map"]["wall_iou_tolerant"] > 0.5
 
 
 def test_two_bags_of_one_vehicle_are_refused(mission, tmp_path, capsys) -> None:
