@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from closeness import are_near
 from scipy.optimize import minimize
 
 from uw_dslam_ros2.core.features.grid_filter import clean_cells
@@ -186,7 +187,7 @@ def test_evidence_of_a_window_counts_its_poses():
     centred = SE2(-3.0, -3.0) @ T_grids @ SE2(-3.0, -3.0).inverse()
     near, poses = match_evidence(source, target, prior=PriorWindow(centred, 0.5, 0.1))
     assert near.log_volume < whole.log_volume - 5.0
-    assert poses[0][1].distance_to(centred) < (0.02, 0.01)  # 0.005 m was seen
+    assert are_near(poses[0][1], centred, 0.02, 0.01)  # 0.005 m was seen
     # Twice as wide both ways is four times as many poses, twice the turns twice as many; a little
     # more or less, for a window about the source's middle allows for the turns.
     wide, turned = (

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from closeness import are_near
 from scipy.stats import chi2
 
 from uw_dslam_ros2.core.errors import InvalidInputError
@@ -151,7 +152,7 @@ def test_own_weights_and_deviations_are_used():
         source_sigma_m=rng.choice([0.02, 0.05], 25), target_sigma_m=rng.uniform(0.02, 0.05, 40),
     )  # fmt: skip
     assert result.is_accepted
-    assert result.T_target_source.distance_to(PLANTED) < (1e-6, 1e-6)
+    assert are_near(result.T_target_source, PLANTED, 1e-6, 1e-6)
 
 
 @pytest.mark.parametrize(
