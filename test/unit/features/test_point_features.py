@@ -5,7 +5,6 @@ import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.features.clustering import cluster_filter, mean_spacing
-from uw_dslam_ros2.core.features.mixture import mixture_of
 from uw_dslam_ros2.core.features.sampling import sample_voxels, voxel_size
 
 
@@ -52,15 +51,6 @@ def test_the_seed_decides_which_point():
 def test_next_to_nothing_stays_what_it_is(num):
     assert len(sample_voxels(np.zeros((num, 2)))) == num
     assert len(cluster_filter(np.zeros((num, 2)))) == num
-
-
-def test_mixture_is_normalised():
-    points = np.random.default_rng(5).uniform(size=(200, 2))
-    mixture = mixture_of(points, 0.05)
-    assert mixture.weights.sum() == pytest.approx(1.0)
-    assert (mixture.sigmas_m == 0.05).all()
-    assert {tuple(p) for p in mixture.means} <= {tuple(p) for p in points}
-    assert len(mixture_of(np.zeros((0, 2)), 0.05).means) == 0
 
 
 @pytest.mark.parametrize("bad", [np.zeros(3), np.zeros((2, 3)), np.full((2, 2), np.nan)])

@@ -1,1 +1,1 @@
-"""Points of a grid: features, clustering filter, density-uniform sampling, mixture."""
+"""Points of a grid: features, clustering filter, density-uniform sampling."""
