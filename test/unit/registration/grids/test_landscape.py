@@ -10,7 +10,8 @@ from uw_dslam_ros2.core.registration.grids import landscape as grid_landscape
 from uw_dslam_ros2.core.registration.grids import landscape_kernels
 from uw_dslam_ros2.core.registration.grids.landscape import distinct, scan_landscape
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
-from uw_dslam_ros2.core.registration.grids.signed_field import PAD, SignedField
+from uw_dslam_ros2.core.registration.grids.signed_field import PAD, padded_field
+from uw_dslam_ros2.core.registration.search.field import Field
 
 _SHAPES = [((12, 17), (14, 11)), ((3, 30), (9, 9)), ((10, 10), (2, 21))]
 
@@ -25,7 +26,7 @@ def _problem(source: tuple[int, int], target: tuple[int, int]) -> GridProblem:
         # Points on the very edge of a map must find room, too.
         points[:4] = [[-0.5, -0.5], [cols - 0.5, -0.5], [-0.5, rows - 0.5], [cols - 0.5] * 2]
         points[3, 1] = rows - 0.5
-        sides.append((points, SignedField(field)))
+        sides.append((points, padded_field(field)))
     weights = rng.uniform(0.0, 1.0, (2, 25)) ** 2
     weights *= 0.5 / weights.sum(axis=1, keepdims=True)
     (source_points, source_field), (target_points, target_field) = sides
@@ -36,9 +37,9 @@ def _problem(source: tuple[int, int], target: tuple[int, int]) -> GridProblem:
     )  # fmt: skip
 
 
-def _bilinear(field: SignedField, points: np.ndarray) -> np.ndarray:
+def _bilinear(field: Field, points: np.ndarray) -> np.ndarray:
     """Field between its cells, zero outside, at points (..., 2)."""
-    rim = 60
+    rim = 90
     image = np.pad(field.coefficients.astype(float), rim)
     cell = np.floor(points).astype(int)
     fx, fy = np.moveaxis(points - cell, -1, 0)

@@ -5,19 +5,13 @@ import pytest
 
 from uw_dslam_ros2.core.features.grid_filter import clean_cells
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.registration.grids import kernels as grid_kernels
-from uw_dslam_ros2.core.registration.grids import search as grid_search
 from uw_dslam_ros2.core.registration.grids.landscape import scan_landscape
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow, build_problem
-from uw_dslam_ros2.core.registration.grids.signed_field import (
-    PAD,
-    SignedField,
-    curvature_tables,
-    refined,
-    signed_field,
-    value_tables,
-    wall_distance,
-)
+from uw_dslam_ros2.core.registration.grids.search import search_poses, whole_plane
+from uw_dslam_ros2.core.registration.grids.signed_field import PAD, signed_field, wall_distance
+from uw_dslam_ros2.core.registration.search import kernels
+from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome, SearchSettings, Status
+from uw_dslam_ros2.core.registration.search.problem import Problem
 
 
 def _room(rng: np.random.Generator, size: int) -> OccupancyMap:
@@ -44,9 +38,12 @@ def problem() -> GridProblem:
     return _problem(1)
 
 
-def _search(problem: GridProblem, window: PoseWindow, gap: float) -> grid_search.SearchOutcome:
-    limits = grid_search.SearchLimits(gap, 3_000_000)
-    return grid_search.search_poses(problem, window, window.middle, limits)
+def _search(problem: GridProblem, window: PoseWindow, gap: float) -> SearchOutcome:
+    return search_poses(problem, window, window.middle, SearchSettings(gap, 3_000_000))
+
+
+def _values(problem: GridProblem, poses: np.ndarray) -> np.ndarray:
+    return np.array([problem.value(pose) for pose in poses])
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -57,78 +54,53 @@ def test_certificate_holds_against_dense_evaluation(seed):
     thetas = np.arange(-1.2, 1.8, 0.06)
     axes = [np.arange(m - h, m + h, 0.5) for m, h in zip(window.middle, window.half, strict=True)]
     poses = np.stack(np.meshgrid(thetas, *axes[1:], indexing="ij"), axis=-1).reshape(-1, 3)
-    dense = float(grid_kernels.objective_at(poses, *problem.arguments).max())
+    dense = float(_values(problem, poses).max())
     assert outcome.is_complete
     assert outcome.lower_bound <= outcome.upper_bound
     assert dense <= outcome.upper_bound + 1e-9
     assert outcome.lower_bound >= (1.0 - 0.02) * dense - 1e-9
     assert outcome.upper_bound <= outcome.lower_bound / (1.0 - 0.02) + 1e-9
-    assert outcome.lower_bound == pytest.approx(problem.value(outcome.pose), abs=1e-9)
+    # Refined, the fields are rounded once more.
+    assert outcome.lower_bound == pytest.approx(problem.value(outcome.pose), abs=1e-7)
+
+
+def _bounds(problem: Problem, box: np.ndarray) -> tuple[float, float]:
+    """Bound by the greatest value that each point can reach, and that by curvature."""
+    cells, out = np.empty((4, problem.points.shape[1]), np.int32), np.empty(5)
+    first = kernels.bound_first(problem.sum, problem.bounds.windows, box, -np.inf, cells)
+    room = np.empty((14, problem.points.shape[1]))
+    kernels.bound_second(problem.sum, problem.bounds.curvatures, box, out, cells, room)
+    return first, float(out[0])
 
 
 @pytest.mark.parametrize("half", [8.0, 3.0, 1.0, 0.5, 0.2, 0.05])
-def test_no_pose_of_a_box_exceeds_its_bound(problem, half):
+@pytest.mark.parametrize("num_refinements", [0, 1, 2])
+def test_no_pose_of_a_box_exceeds_its_bound(problem, half, num_refinements):
     rng = np.random.default_rng(3)
-    search = grid_search._Search(problem, np.zeros(3), grid_search.SearchLimits(0.1, 1), None)
+    searched = Problem(problem.terms(num_refinements), np.zeros(2), np.zeros(2))
     boxes = np.column_stack([rng.uniform(-3, 3, 40), rng.uniform(-5, 25, (40, 2))])
-    half_rad = half / problem.radius
-    for arguments in (search._coarse, search._fine):
-        for is_smooth in (False, True):
-            bounds, _ = grid_kernels.bound_boxes(
-                boxes, np.full(40, np.inf), half_rad, half, -np.inf, is_smooth, False, *arguments
-            )
-            for box, bound in zip(boxes, bounds, strict=True):
-                offsets = rng.uniform(-1, 1, (60, 3)) * (half_rad, half, half)
-                values = grid_kernels.objective_at(box + offsets, *problem.arguments)
-                assert values.max() <= bound + 1e-9
+    halves = np.array([half / problem.radius, half, half])
+    for box in boxes:
+        bounds = _bounds(searched, np.concatenate([box, halves]))
+        values = _values(problem, box + rng.uniform(-1, 1, (60, 3)) * halves)
+        assert values.max() <= min(bounds) + 1e-7
 
 
 def test_small_boxes_close_quadratically(problem):
     pose, _ = problem.ascend(scan_landscape(problem, 1).poses[0])
-    search = grid_search._Search(problem, pose, grid_search.SearchLimits(0.1, 1), None)
+    searched = Problem(problem.terms(2), np.zeros(2), np.zeros(2))
     slack = []
     for half in (0.1, 0.05):
-        bounds, _ = grid_kernels.bound_boxes(
-            pose[None, :], np.full(1, np.inf), half / problem.radius, half, -np.inf, True, False,
-            *search._fine,
-        )  # fmt: skip
-        slack.append(bounds[0] - problem.value(pose))
+        box = np.array([*pose, half / problem.radius, half, half])
+        slack.append(_bounds(searched, box)[1] - problem.value(pose))
     assert slack[1] < 0.35 * slack[0]
-
-
-def test_tables_bound_the_field_and_its_refinement_is_the_same_function():
-    rng = np.random.default_rng(5)
-    field = SignedField(np.pad(rng.uniform(-0.7, 1.0, (12, 15)), PAD).astype(np.float32))
-    points = rng.uniform(-2.0, 14.0, (300, 2))
-    weights, none = np.ones(1), np.empty((0, 2))
-    values = value_tables(field) * grid_kernels.TABLE_STEP
-    bends = curvature_tables(field) * grid_kernels.CURVATURE_STEP
-    fine = refined(field).coefficients
-    for point in points:
-        row, col = np.floor(point[::-1] + PAD + 0.5).astype(int)
-
-        def value(at: np.ndarray, coefficients: np.ndarray, pad: float) -> float:
-            return grid_kernels.objective(
-                np.zeros(3), at[None, :], weights, coefficients,
-                none, np.empty(0), coefficients, np.zeros(2), pad,
-            )[0]  # fmt: skip
-
-        here = value(point, field.coefficients, float(PAD))
-        assert here <= values[0, row, col] + 1e-9
-        assert here == pytest.approx(value(2.0 * point + 0.5, fine, 2.0 * PAD), abs=1e-6)
-        step = np.array([0.03, 0.0])
-        around = value(point + step, field.coefficients, float(PAD)) + value(
-            point - step, field.coefficients, float(PAD)
-        )
-        window = bends[2, row - 1, col - 1]  # three cells wide, the point's in the middle
-        assert (around - 2.0 * here) / 0.03**2 <= window + 1e-6
 
 
 def test_gradient_is_that_of_the_objective(problem):
     rng = np.random.default_rng(7)
     for _ in range(20):
         pose = np.array([rng.uniform(-3, 3), *rng.uniform(0, 20, 2)])
-        _, *gradient = grid_kernels.objective(pose, *problem.arguments)
+        gradient = problem.gradient(pose)
         for axis in range(3):
             step = np.zeros(3)
             step[axis] = 1e-5
@@ -149,27 +121,27 @@ def test_poses_and_motions_undo_each_other(problem):
 
 def test_landscape_peaks_are_the_objective_there(problem):
     landscape = scan_landscape(problem, 10)
-    values = grid_kernels.objective_at(landscape.poses, *problem.arguments)
+    values = _values(problem, landscape.poses)
     # The scan spreads points over four cells and interpolates the turned field.
     np.testing.assert_allclose(landscape.scores, values, atol=0.12)
     assert (np.diff(landscape.scores) <= 0).all()
 
 
 def test_a_short_budget_still_gives_true_bounds(problem):
-    window = grid_search.whole_plane(problem)
+    window = whole_plane(problem)
     full = _search(problem, window, 0.02)
-    limits = grid_search.SearchLimits(0.02, 1000)
-    short = grid_search.search_poses(problem, window, window.middle, limits)
+    short = search_poses(problem, window, window.middle, SearchSettings(0.02, 100))
     assert not short.is_complete
     assert short.upper_bound >= full.lower_bound
     assert short.lower_bound <= full.upper_bound
 
 
 def test_a_stopped_search_says_so(problem):
-    window = grid_search.whole_plane(problem)
-    limits = grid_search.SearchLimits(0.02, 3_000_000, lambda: True)
-    outcome = grid_search.search_poses(problem, window, window.middle, limits)
-    assert outcome.is_stopped
+    window = whole_plane(problem)
+    outcome = search_poses(
+        problem, window, window.middle, SearchSettings(0.02), is_cancelled=lambda: True
+    )
+    assert outcome.status is Status.CANCELLED
     assert not outcome.is_complete
 
 
@@ -198,9 +170,7 @@ def test_distances_to_walls_are_exact_to_the_last_bit():
 
 def test_a_stopped_search_tells_where_it_did_not_look(problem):
     window = PoseWindow(np.array([0.3, 10.0, 10.0]), np.array([1.5, 8.0, 8.0]))
-    stopped = grid_search.search_poses(
-        problem, window, window.middle, grid_search.SearchLimits(0.02, 1000)
-    )
+    stopped = search_poses(problem, window, window.middle, SearchSettings(0.02, 100))
     assert not stopped.is_complete
     assert 0 < len(stopped.open_poses) <= 64
     offset = np.abs(stopped.open_poses - window.middle)
@@ -217,18 +187,3 @@ def test_many_climbs_end_where_each_alone_does(problem):
         np.testing.assert_array_equal(alone, pose)
         assert best == value
         assert value >= problem.value(start)
-
-
-def test_swept_boxes_get_the_second_bound_or_keep_theirs(problem):
-    pose, _ = problem.ascend(scan_landscape(problem, 1).poses[0])
-    search = grid_search._Search(problem, pose, grid_search.SearchLimits(0.1, 1), None)
-    boxes, half_rad = pose + np.array([[0.0, 0.0, 0.0], [0.02, 0.3, -0.2]]), 0.1 / problem.radius
-    bounds = [
-        grid_kernels.bound_boxes(
-            boxes, np.full(2, parent), half_rad, 0.1, -np.inf, True, is_swept, *search._fine
-        )[0]
-        for parent, is_swept in ((np.inf, True), (np.inf, False), (0.01, True))
-    ]
-    assert (bounds[0] >= bounds[1]).all()
-    assert (bounds[0] >= grid_kernels.objective_at(boxes, *problem.arguments)).all()
-    np.testing.assert_array_equal(bounds[2], 0.01)

@@ -59,14 +59,9 @@ def bound_box(problem, box, floor=-math.inf):
     """Both bounds and the value at the centre."""
     box, out = np.asarray(box), np.empty(5)
     cells = np.empty((4, problem.points.shape[1]), dtype=np.int32)
-    first = kernels.bound_first(
-        problem.points, problem.rows, problem.frames, problem.levels, problem.level_of,
-        problem.half_of, problem.bounds, problem.windows, box, floor, cells,
-    )  # fmt: skip
-    kernels.bound_second(
-        problem.points, problem.rows, problem.frames, problem.half_of, problem.coefficients,
-        problem.curvatures, box, out, cells, np.empty((14, problem.points.shape[1])),
-    )  # fmt: skip
+    first = kernels.bound_first(problem.sum, problem.bounds.windows, box, floor, cells)
+    room = np.empty((14, problem.points.shape[1]))
+    kernels.bound_second(problem.sum, problem.bounds.curvatures, box, out, cells, room)
     return first, out[0], out[1]
 
 

@@ -297,16 +297,11 @@ def bounds_of(problem, box, floor):
     box, out = np.array(box), np.empty(5)
     cells = np.empty((4, problem.points.shape[1]), dtype=np.int32)
     first, early = (
-        kernels.bound_first(
-            problem.points, problem.rows, problem.frames, problem.levels, problem.level_of,
-            problem.half_of, problem.bounds, problem.windows, box, lowest, cells,
-        )
+        kernels.bound_first(problem.sum, problem.bounds.windows, box, lowest, cells)
         for lowest in (-math.inf, floor)
     )  # fmt: skip
-    kernels.bound_second(
-        problem.points, problem.rows, problem.frames, problem.half_of, problem.coefficients,
-        problem.curvatures, box, out, cells, np.empty((14, problem.points.shape[1])),
-    )  # fmt: skip
+    room = np.empty((14, problem.points.shape[1]))
+    kernels.bound_second(problem.sum, problem.bounds.curvatures, box, out, cells, room)
     return first, early, out[0]
 
 

@@ -25,7 +25,32 @@ def some_fields(rng):
     yield mixture_field(centers, weights, sigmas)
     yield likelihood_field(centers, weights, np.full(30, 0.1), 40.0)
     yield field_from_samples(rng.normal(size=(17, 40)), (-2.0, 1.0), 0.25)
-    yield field_from_samples(rng.normal(size=(1, 1)), (0.0, 0.0), 0.1, is_interpolated=True)
+    yield field_from_samples(rng.normal(size=(1, 1)), (0.0, 0.0), 0.1)
+
+
+def rectangle(field, low, high):
+    """Cells that the rectangle from low to high touches: first column and row, last ones."""
+    first = np.floor((np.asarray(low) - field.origin) / field.pitch_m + 0.5 - 1e-9).astype(int)
+    last = np.floor((np.asarray(high) - field.origin) / field.pitch_m + 0.5 + 1e-9).astype(int)
+    end = np.array(field.coefficients.shape)[::-1] - 1
+    return *np.clip(first, 0, end), *np.clip(last, 0, end)
+
+
+def largest(windows, col, row, last_col, last_row):
+    """What the kernels read: the maximum of four windows; None where there are none so large."""
+    span = max(last_col - col, last_row - row)
+    level = int(math.log2(span + 1))
+    if level >= len(windows):
+        return None
+    size = 1 << level
+    rows, cols = [row, max(row, last_row - size + 1)], [col, max(col, last_col - size + 1)]
+    return float(windows[level][np.ix_(rows, cols)].max())
+
+
+def upper_bound(field, low, high):
+    """Of the values in a rectangle, from the windows, or over the whole plane."""
+    value = largest(field.tables[0], *rectangle(field, low, high))
+    return field.maximum if value is None else value
 
 
 @pytest.mark.parametrize("size", [0.0, 0.01, 0.07, 0.3, 1.0, 4.0])
@@ -37,7 +62,7 @@ def test_bounds_hold_in_random_rectangles(size):
             low = field.origin + rng.uniform(-0.2, 1.0, 2) * extent
             high = low + size * rng.uniform(0.0, 1.0, 2)
             points = rng.uniform(low, high, (100, 2))
-            assert field.values(points).max() <= field.upper_bound(low, high)
+            assert field.values(points).max() <= upper_bound(field, low, high)
 
 
 def test_curvature_bounds_the_taylor_remainder():
@@ -47,13 +72,39 @@ def test_curvature_bounds_the_taylor_remainder():
         for _ in range(200):
             low = field.origin + rng.uniform(-0.1, 1.0, 2) * extent
             high = low + rng.uniform(0.0, 8.0, 2) * field.pitch_m
-            curvature = field.curvature_bound(low, high)
+            curvature = largest(field.tables[1], *rectangle(field, low, high))
             a, b = rng.uniform(low, high, (2, 2))
             middle, ends = field.values([0.5 * (a + b)])[0], field.values([a, b]).mean()
             # A second derivative of at most c lets the mean of the ends rise c |b - a|^2 / 8 above
             # the middle.
             slack = 1e-9 * (1.0 + np.abs(field.coefficients).max())
             assert ends - middle <= curvature * ((b - a) ** 2).sum() / 8.0 + slack
+
+
+def test_refined_it_is_the_same_function_with_closer_bounds():
+    rng = np.random.default_rng(7)
+    for field in some_fields(rng):
+        fine = field.refined()
+        extent = field.pitch_m * np.array(field.coefficients.shape)[::-1]
+        points = field.origin + rng.uniform(-0.1, 1.1, (2000, 2)) * extent
+        peak = np.abs(field.coefficients).max()
+        np.testing.assert_allclose(fine.values(points), field.values(points), atol=1e-6 * peak)
+        bounds = fine.tables[0][0].reshape(*field.coefficients.shape[:1], 2, -1, 2)
+        coarse = field.tables[0][0]
+        assert (bounds.max(axis=(1, 3)) <= coarse + 1e-6 * peak).all()
+
+
+def test_slopes_are_those_of_the_values():
+    rng = np.random.default_rng(8)
+    for field in some_fields(rng):
+        extent = field.pitch_m * np.array(field.coefficients.shape)[::-1]
+        points = field.origin + rng.uniform(0.0, 1.0, (200, 2)) * extent
+        slopes, step = field.slopes(points), 1e-5 * field.pitch_m
+        for axis in range(2):
+            ahead = points + step * np.eye(2)[axis]
+            behind = points - step * np.eye(2)[axis]
+            change = (field.values(ahead) - field.values(behind)) / (2.0 * step)
+            np.testing.assert_allclose(slopes[:, axis], change, atol=1e-3 * np.abs(slopes).max())
 
 
 @pytest.mark.parametrize("nodes_per_sigma", [1.0, 3.0, 5.0])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration.grids.landscape import Landscape, distinct, scan_landscape
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
-from uw_dslam_ros2.core.registration.grids.search import SearchOutcome
+from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome
 from uw_dslam_ros2.core.se2 import wrap_angle
 
 __all__ = ["Candidate", "Chance", "climb", "log_volume", "merge_best", "scan_candidates"]

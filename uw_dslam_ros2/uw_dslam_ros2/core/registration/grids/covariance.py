@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.registration.grids import kernels as grid_kernels
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem
 
 __all__ = ["curvature", "pose_covariance", "slide_share"]
@@ -37,8 +36,8 @@ def curvature(problem: GridProblem, pose: FloatArray) -> FloatArray:
     for axis in range(3):
         offset = np.zeros(3)
         offset[axis] = step
-        ahead = np.array(grid_kernels.objective(pose + offset * scale, *problem.arguments)[1:])
-        behind = np.array(grid_kernels.objective(pose - offset * scale, *problem.arguments)[1:])
+        ahead = problem.gradient(pose + offset * scale)
+        behind = problem.gradient(pose - offset * scale)
         hessian[axis] = (ahead - behind) * scale / (2.0 * step)
     return -0.5 * (hessian + hessian.T)
 
@@ -62,7 +61,7 @@ def pose_covariance(
     ``sigma_cells`` is the kernel of the walls, ``slide`` the `slide_share` of the pose.
     """
     scale = np.array([1.0 / problem.radius, 1.0, 1.0])
-    pulls, places = grid_kernels.point_gradients(pose, *problem.arguments)
+    pulls, places = problem.point_gradients(pose)
     weights = np.concatenate([problem.source_weights, problem.target_weights])
     is_pulling = np.abs(pulls).sum(axis=1) > 0.0
     pulls, places, weights = pulls[is_pulling] * scale, places[is_pulling], weights[is_pulling]

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence
 from uw_dslam_ros2.core.features.walls import wall_points
-from uw_dslam_ros2.core.registration.grids import kernels as grid_kernels
-from uw_dslam_ros2.core.registration.grids.signed_field import PAD, SignedField, signed_field
+from uw_dslam_ros2.core.registration.grids.signed_field import signed_field
+from uw_dslam_ros2.core.registration.search.field import Field
+from uw_dslam_ros2.core.registration.search.problem import Problem, Term
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 __all__ = ["GridProblem", "PoseWindow", "build_problem"]
 
 FloatArray = NDArray[np.float64]
 FloatGrid = NDArray[np.float32]
+_LONGEST_STEP_CELLS = 2.0  # of a climb
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +37,7 @@ class PoseWindow:
         return bool(np.all(np.abs(offset) <= self.half))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class GridProblem:
     """The objective of matching two maps, both directions summed.
 
@@ -48,41 +50,70 @@ class GridProblem:
     resolution_m: float
     source_points: FloatArray
     source_weights: FloatArray
-    source_field: SignedField
+    source_field: Field
     target_points: FloatArray
     target_weights: FloatArray
-    target_field: SignedField
+    target_field: Field
     center: FloatArray
-    radius: float = field(init=False)  # of the source's points about their mean, root mean square
 
-    def __post_init__(self) -> None:
+    @functools.cached_property
+    def radius(self) -> float:
+        """Root mean square distance of the source's points from their mean."""
         square = (self.source_points**2).sum(axis=1)
-        radius = math.sqrt(float(square.mean())) if len(square) else 0.0
-        object.__setattr__(self, "radius", max(radius, 1.0))
+        return max(math.sqrt(float(square.mean())) if len(square) else 0.0, 1.0)
 
-    @property
-    def arguments(self) -> tuple[Any, ...]:
-        """Arguments of the kernels after the pose."""
-        return (
-            self.source_points, self.source_weights, self.target_field.coefficients,
-            self.target_points, self.target_weights, self.source_field.coefficients,
-            self.center, float(PAD),
-        )  # fmt: skip
+    def terms(self, num_refinements: int = 0) -> list[Term]:
+        """Both directions, with fields on lattices so many times twice as fine."""
+        target_field, source_field = self.target_field, self.source_field
+        source_field = replace(source_field, origin=source_field.origin - self.center)
+        for _ in range(num_refinements):
+            target_field, source_field = target_field.refined(), source_field.refined()
+        return [
+            Term(self.source_points, self.source_weights, target_field),
+            Term(self.target_points, self.target_weights, source_field, is_inverse=True),
+        ]
+
+    @functools.cached_property
+    def _sum(self) -> Problem:
+        problem = Problem(self.terms(), np.zeros(2), np.zeros(2))
+        problem.window[3:] = math.inf  # climbs go where they like
+        return problem
 
     def value(self, pose: FloatArray) -> float:
         """Objective at a pose (3,)."""
-        return float(grid_kernels.objective(pose, *self.arguments)[0])
+        return self._sum.value_at(pose)[0]
+
+    def gradient(self, pose: FloatArray) -> FloatArray:
+        """Gradient (3,) of the objective [1 / rad, 1 / cell, 1 / cell]."""
+        return self._sum.value_at(pose)[1]
+
+    def point_gradients(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Each point's part of the gradient (M + N, 3), and its place in target cells (M + N, 2).
+
+        The source's points come first.
+        """
+        turn = SE2(0.0, 0.0, float(pose[0])).rotation()
+        moved = self.source_points @ turn.T
+        places = np.concatenate([moved + pose[1:], self.target_points])
+        slopes = self.source_weights[:, None] * self.target_field.slopes(places[: len(moved)])
+        back = (self.target_points - pose[1:]) @ turn
+        behind = self.source_field.slopes(back + self.center)
+        behind = self.target_weights[:, None] * (behind @ turn.T)
+        pulls = np.concatenate([slopes, -behind])
+        arms = np.concatenate([moved, self.target_points - pose[1:]])
+        turns = pulls[:, 1] * arms[:, 0] - pulls[:, 0] * arms[:, 1]
+        return np.column_stack([turns, pulls]), places
 
     def ascend(self, pose: FloatArray, max_steps: int = 40) -> tuple[FloatArray, float]:
         """Local maximum that a pose (3,) climbs to, and its value."""
-        found, values = self.ascend_all(np.asarray(pose)[None, :], max_steps)
-        return found[0], float(values[0])
+        value, found = self._sum.ascend(pose, max_steps, _LONGEST_STEP_CELLS)
+        return found, value
 
     def ascend_all(self, poses: FloatArray, max_steps: int = 40) -> tuple[FloatArray, FloatArray]:
         """Local maxima (K, 3) that poses (K, 3) climb to, and their values (K,)."""
-        starts = np.array(poses, dtype=np.float64, order="C")
-        found, values = grid_kernels.ascend_all(starts, self.radius, max_steps, *self.arguments)
-        return found, values
+        climbed = [self.ascend(pose, max_steps) for pose in poses]
+        found, values = zip(*climbed, strict=True) if climbed else ((), ())
+        return np.array(found).reshape(-1, 3), np.array(values)
 
     def to_motion(self, pose: FloatArray) -> SE2:
         """Pose (3,) in working cells to the motion between the grids' own axes [m]."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,7 @@ from uw_dslam_ros2.core.registration.grids.probability import (
     probability_of,
 )
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
-from uw_dslam_ros2.core.registration.grids.search import (
-    SearchLimits,
-    SearchOutcome,
-    search_poses,
-)
+from uw_dslam_ros2.core.registration.grids.search import search_poses
 from uw_dslam_ros2.core.registration.grids.symmetry import add_twins
 from uw_dslam_ros2.core.registration.grids.verdict import Proof, decide
 from uw_dslam_ros2.core.registration.result import (
@@ -38,6 +35,7 @@ from uw_dslam_ros2.core.registration.result import (
     Rival,
     Verdict,
 )
+from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome, SearchSettings, Status
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["GridRegistrationConfig", "match_evidence", "register_grids"]
@@ -187,22 +185,23 @@ class _GridMatch:
         progress: Callable[[Progress], None] | None,
         is_cancelled: Callable[[], bool] | None,
     ) -> SearchOutcome:
-        def should_stop() -> bool:
-            if is_cancelled is not None and is_cancelled():
-                self._is_cancelled = True
-                return True
-            clock = self._clock
-            return clock is not None and clock() - self._start_s > self._config.max_seconds
+        config = self._config
+        left_s = math.inf
+        if self._clock is not None:
+            left_s = max(config.max_seconds - (self._clock() - self._start_s), 0.0)
 
-        def report(
-            pose: FloatArray, lower: float, upper: float, num_boxes: int, num_open: int
-        ) -> None:
+        def report(told: Progress) -> None:
             if progress is not None:
-                motion = self._frames.to_frames(problem.to_motion(pose))
-                progress(Progress("search", lower, upper, num_boxes, num_open, motion))
+                T = told.T_target_source
+                motion = problem.to_motion(np.array([T.yaw, T.x, T.y]))
+                progress(replace(told, T_target_source=self._frames.to_frames(motion)))
 
-        limits = SearchLimits(self._config.gap, num_boxes, should_stop)
-        return search_poses(problem, window, start, limits, report)
+        outcome = search_poses(
+            problem, window, start, SearchSettings(config.gap, num_boxes, left_s),
+            clock=self._clock, progress=report, is_cancelled=is_cancelled,
+        )  # fmt: skip
+        self._is_cancelled = outcome.status is Status.CANCELLED
+        return outcome
 
     def _answer(
         self, levels: list[GridProblem], outcome: SearchOutcome, found: Found

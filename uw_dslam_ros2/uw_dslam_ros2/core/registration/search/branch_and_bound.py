@@ -8,30 +8,27 @@ in::
                                                   weight * field(T^-1 p)     inverse: target
                                                   points, source field
 
-with ``T = T_target_source``. Weights are not negative; the fields may have any sign. A point
-mixture is one forward term; maps with evidence of free space are two::
+with ``T = T_target_source``. Weights are not negative; the fields may have any sign. Point sets
+are one forward term, or one for each kernel; two maps, with walls positive and free space
+negative, are two::
 
-    wall_terms = [
-        Term(source_walls, source_weights, field_from_samples(target_evidence, origin, pitch_m)),
-        Term(target_walls, target_weights, field_from_samples(source_evidence, origin, pitch_m),
-        is_inverse=True),
+    terms = [
+        Term(source_walls, source_weights, target_field),
+        Term(target_walls, target_weights, source_field, is_inverse=True),
     ]
-    outcome = search(wall_terms, SearchSettings(gap=0.01, max_seconds=2.0), clock=time.monotonic)
-    outcome.T_target_source, outcome.lower_bound, outcome.upper_bound, outcome.status,
-    outcome.optima
+    outcome = search(terms, SearchSettings(gap=0.01, max_seconds=2.0), clock=time.monotonic)
+    outcome.T_target_source, outcome.lower_bound, outcome.upper_bound, outcome.status
 
 Points are in metres in their own map's frame, the field of a forward term lies in the target's
 frame, that of an inverse term in the source's. Offsets (UTM) are taken out inside.
 ``objective_at`` evaluates the same sum at any pose.
 
-The search is best first over boxes of (theta, x, y). A box is bounded twice: each point's
-reachable rectangle against the field's range-maximum pyramid, and, where boxes are small, by
-value, summed gradient and bounded curvature at the centre (Consolini et al., arXiv 1901.09641),
-which alone closes the gap. Local ascent from promising centres gives the lower bound (GOGMA, arXiv
+A *sweep* (`sweep`) first bounds all boxes of (theta, x, y) of equal size together, level by level.
+The search then goes on best first with the few boxes that it leaves. A box is bounded twice: each
+point's reachable rectangle against the field's range maxima, and, where boxes are small, by value,
+summed gradient and bounded curvature at the centre (Consolini et al., arXiv 1901.09641), which
+alone closes the gap. Local ascent from promising centres gives the lower bound (GOGMA, arXiv
 1603.00150) and does not touch the proof.
-
-Where one field is asked over all motions, a *sweep* (`sweep`) bounds all boxes of equal size
-together first, and the best-first search starts from the few that it leaves.
 
 With ``SearchSettings.keep`` below 1 the search then goes on to the rivals: every box that could
 hold ``keep`` times the best value is followed until it is excluded or lies in the neighbourhood of
@@ -54,6 +51,7 @@ from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome, Search
 from uw_dslam_ros2.core.registration.search.problem import Problem, Term, as_points
 from uw_dslam_ros2.core.registration.search.rivals import Neighborhoods
 from uw_dslam_ros2.core.registration.search.sweep import Sweep
+from uw_dslam_ros2.core.registration.search.sweep_kernels import SIDE
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = [
@@ -63,6 +61,7 @@ __all__ = [
     "Status",
     "Term",
     "as_points",
+    "maximise",
     "objective_at",
     "search",
 ]
@@ -72,7 +71,8 @@ FloatArray = NDArray[np.float64]
 _BOX_BYTES = 7 * 8 + 8 + 4
 _CHUNK = 2048  # boxes between two looks at the clock
 _MAX_OPTIMA = 512  # local optima remembered
-_CELLS_PER_BOX = 32  # cells of a sweep that cost as much as a box
+_TILE_BYTES = 8 * SIDE**2 + 100
+_NUM_OPEN_POSES = 64
 _NUM_CENTRES = 24  # cells of each of its levels whose centres are looked at
 _NUM_CLIMBS = 4  # and of these, climbed from
 
@@ -109,9 +109,10 @@ def search(
     progress, is_cancelled : callable
         Called every few thousand boxes.
     """
-    settings = settings or SearchSettings()
-    problem = Problem(terms, is_source_centred=prior is None)
-    if prior is not None:
+    if prior is None:
+        problem = Problem(terms)
+    else:
+        problem = Problem(terms, source_center=np.zeros(2))
         if not (prior.half_width_m > 0.0 and prior.half_width_rad > 0.0):
             raise InvalidInputError(
                 f"prior half widths are {prior.half_width_m} m and {prior.half_width_rad} rad, "
@@ -120,208 +121,208 @@ def search(
         problem.window[:3] = problem.from_pose(prior.T_target_source)
         problem.window[3] = min(prior.half_width_rad, math.pi)
         problem.window[4:] = prior.half_width_m
-    return _Search(problem, settings, clock, prior is None).run(progress, is_cancelled, stage)
+    return maximise(
+        problem, settings, clock=clock, progress=progress, is_cancelled=is_cancelled, stage=stage
+    )
+
+
+def maximise(
+    problem: Problem,
+    settings: SearchSettings | None = None,
+    *,
+    start: FloatArray | None = None,
+    clock: Callable[[], float] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    is_cancelled: Callable[[], bool] | None = None,
+    stage: str = "search",
+) -> SearchOutcome:
+    """The same as `search` for a `Problem`, over its window.
+
+    ``start`` is a pose (theta, x, y) of the window to beat, its middle where None.
+    """
+    settings = settings or SearchSettings()
+    return _Search(problem, settings, start, clock, progress, is_cancelled, stage).run()
 
 
 class _Search:
-    """The arrays of one running search."""
+    """One running search."""
 
     def __init__(
         self,
         problem: Problem,
         settings: SearchSettings,
+        start: FloatArray | None,
         clock: Callable[[], float] | None,
-        is_swept: bool,
-    ) -> None:
-        self._problem = problem
-        self._settings = settings
-        self._clock = clock
-        self._start = clock() if clock else math.nan
-        self._is_swept = is_swept
-        self._num_cells = 0
-        self._max_slots = max(64, int(settings.max_memory_mb * 1e6 / _BOX_BYTES))
-        slots = min(8192, self._max_slots)
-        self._boxes = np.empty((slots, 7))
-        self._keys = np.empty(slots)
-        self._heap = np.arange(slots, dtype=np.int32)
-        self._counters = np.zeros(5, dtype=np.int64)
-        self._found = np.full((_MAX_OPTIMA, 5), -math.inf)
-        self._worth = np.ones(32)  # of the bound by curvature, by size of a box
-        value, _, _ = problem.value_at(problem.window[:3])
-        self._best = np.array([value, *problem.window[:3], 0.0, -math.inf])
-        self._boxes[0, :6] = problem.window
-        self._boxes[0, 6] = 0
-        self._keys[0] = problem.margin + sum(
-            float(term.weights.sum()) * term.field.maximum for term in problem.terms
-        )
-        self._counters[kernels.NUM_OPEN] = 1
-
-    def run(
-        self,
         progress: Callable[[Progress], None] | None,
         is_cancelled: Callable[[], bool] | None,
         stage: str,
-    ) -> SearchOutcome:
-        """Chunks of boxes until the proof is complete or a budget is used up; then the rivals."""
-        max_boxes = self._settings.max_boxes
-        self._sweep(progress, is_cancelled, stage)
-        status = self._chunks(0.0, max_boxes, progress, is_cancelled, stage)
+    ) -> None:
+        self._problem, self._settings, self._clock = problem, settings, clock
+        self._progress, self._is_cancelled, self._stage = progress, is_cancelled, stage
+        self._start_s = clock() if clock else math.nan
+        self._num_cells = 0
+        self._dropped = -math.inf  # no box that a sweep excluded exceeds it
+        self._max_slots = max(64, int(settings.max_memory_mb * 1e6 / _BOX_BYTES))
+        slots = min(8192, self._max_slots)
+        pose = problem.window[:3] if start is None else start
+        self._state = kernels.State(
+            boxes=np.empty((slots, 7)),
+            keys=np.empty(slots),
+            heap=np.arange(slots, dtype=np.int32),
+            counters=np.zeros(3, dtype=np.int64),
+            best=np.array([problem.value_at(pose)[0], *pose, 0.0, -math.inf]),
+            found=np.full((_MAX_OPTIMA, 5), -math.inf),
+            worth=np.ones(32),
+        )
+        weights = np.array([term.weights.sum() for term in problem.terms])
+        most = problem.margin + float(weights @ problem.frames[:, 4])
+        self._open(problem.window[None, :], np.array([most]), 0)
+
+    def run(self) -> SearchOutcome:
+        """The recipe."""
+        self._sweep()
+        status = self._prove()
         lower, upper = self._bounds()
         has_all_rivals = self._settings.keep >= 1.0
         if status is Status.CERTIFIED and not has_all_rivals:
-            spent = int(self._counters[kernels.NUM_BOXES])
-            max_boxes = min(max_boxes, spent + int(self._settings.rival_share * spent))
-            ended = self._chunks(
-                self._problem.radius, max_boxes, progress, is_cancelled, f"{stage}, rivals"
-            )
-            has_all_rivals = ended is Status.CERTIFIED
+            has_all_rivals = self._follow_rivals() is Status.CERTIFIED
         return self._outcome(status, lower, upper, has_all_rivals)
 
-    def _sweep(
-        self,
-        progress: Callable[[Progress], None] | None,
-        is_cancelled: Callable[[], bool] | None,
-        stage: str,
-    ) -> None:
+    def _sweep(self) -> None:
         """Put the boxes that a sweep leaves in place of the first one, if it fits the budgets."""
-        p, settings = self._problem, self._settings
-        if not (self._is_swept and Sweep.suits(p)):
-            return
-        max_cells = min(self._max_slots - 2, _CELLS_PER_BOX * settings.max_boxes // 4)
-        sweep = Sweep(p, max_cells, settings.max_memory_mb * 1e6 / 4.0)
-        while sweep.advance(self._floor() - p.margin, lambda: self._is_over(is_cancelled)):
-            kernels.climb(
-                p.points, p.rows, p.frames, p.coefficients, p.window, p.arm, p.reach,
-                sweep.highest(_NUM_CENTRES), _NUM_CLIMBS, self._best, self._found, self._counters,
-            )  # fmt: skip
-        self._num_cells = sweep.num_cells
-        if not sweep.num_cells:
-            return
-        boxes, uppers = sweep.boxes(self._floor() - p.margin)
-        count = len(boxes)
-        while len(self._heap) < count + 2:
-            self._grow()
-        # From the highest down, which is a heap.
-        self._boxes[:count, :6] = boxes
-        self._boxes[:count, 6] = kernels.UNSEEN
-        self._keys[:count] = np.minimum(uppers + p.margin, self._keys[0])
-        self._counters[kernels.NUM_OPEN] = count
-        self._counters[kernels.NUM_BOXES] = sweep.num_cells // _CELLS_PER_BOX
-        if progress:
-            progress(self._progress(stage))
-
-    def _is_over(self, is_cancelled: Callable[[], bool] | None) -> bool:
-        return self._is_late() or bool(is_cancelled and is_cancelled())
-
-    def _is_late(self) -> bool:
-        clock = self._clock
-        return clock is not None and clock() - self._start >= self._settings.max_seconds
+        p, settings, state = self._problem, self._settings, self._state
+        max_tiles = int(settings.max_memory_mb * 1e6 / 4.0 / _TILE_BYTES)
+        sweep = Sweep(p, min(max_tiles, settings.max_boxes, self._max_slots // SIDE**2))
+        while sweep.advance(self._floor(), self._is_over):
+            kernels.climb(p.sum, state, sweep.highest(_NUM_CENTRES), _NUM_CLIMBS)
+            self._dropped = min(self._floor() + p.margin, float(state.keys[0]))
+        if sweep.num_tiles:
+            boxes, uppers = sweep.boxes(self._floor())
+            self._num_cells = sweep.num_cells
+            state.counters[kernels.NUM_BOXES] = sweep.num_tiles // 2  # what they cost
+            self._open(boxes, np.minimum(uppers + p.margin, state.keys[0]), kernels.UNSEEN)
+            self._tell()
 
     def _floor(self) -> float:
-        """Bound below which nothing is of interest any more."""
-        return min(float(self._best[0]), self._settings.keep * float(self._best[0]))
+        """Sum below which nothing is of interest any more."""
+        best, settings = float(self._state.best[0]), self._settings
+        share = settings.keep if settings.keep < 1.0 else 1.0 / (1.0 - settings.gap)
+        return (share * best if best > 0.0 else best) - self._problem.margin
 
-    def _chunks(
-        self,
-        apart: float,
-        max_boxes: int,
-        progress: Callable[[Progress], None] | None,
-        is_cancelled: Callable[[], bool] | None,
-        stage: str,
-    ) -> Status:
-        """One phase: the proof with ``apart`` = 0, or that of the rivals."""
-        counters = self._counters
+    def _open(self, boxes: FloatArray, keys: FloatArray, axis: int) -> None:
+        """Begin with these boxes (K, 6), which have their bounds in falling order."""
+        while len(self._state.heap) < len(boxes) + 2:
+            self._grow()
+        state, count = self._state, len(boxes)
+        state.boxes[:count, :6], state.boxes[:count, 6] = boxes, axis
+        state.keys[:count] = keys  # from the highest down, which is a heap
+        state.counters[kernels.NUM_OPEN] = count
+
+    def _prove(self) -> Status:
+        """Split the best box until the gap is closed."""
+        p, gap, keep = self._problem, self._settings.gap, self._settings.keep
+        return self._in_chunks(
+            lambda count: kernels.prove(p.sum, p.bounds, self._state, gap, keep, count),
+            self._settings.max_boxes,
+        )
+
+    def _follow_rivals(self) -> Status:
+        """Follow every box that could hold a rival."""
+        p, settings = self._problem, self._settings
+        spent = int(self._state.counters[kernels.NUM_BOXES])
+        self._stage = f"{self._stage}, rivals"
+        return self._in_chunks(
+            lambda count: kernels.follow_rivals(
+                p.sum, p.bounds, self._state, settings.gap, settings.keep, p.radius, count
+            ),
+            min(settings.max_boxes, spent + int(settings.rival_share * spent)),
+        )
+
+    def _in_chunks(self, advance: Callable[[int], int], max_boxes: int) -> Status:
+        """Go on until it is done or a budget is used up."""
         while True:
-            left = max_boxes - int(counters[kernels.NUM_BOXES])
-            self._run_chunk(min(_CHUNK, max(left, 0)), apart)
+            left = max_boxes - int(self._state.counters[kernels.NUM_BOXES])
+            stopped_for = advance(min(_CHUNK, max(left, 0)))
             status = None
-            if counters[kernels.STATUS] == kernels.DONE:
+            if stopped_for == kernels.DONE:
                 status = Status.CERTIFIED
-            elif counters[kernels.STATUS] == kernels.FOUND_FULL or (
-                counters[kernels.STATUS] == kernels.HEAP_FULL and not self._grow()
+            elif stopped_for == kernels.FOUND_FULL or (
+                stopped_for == kernels.HEAP_FULL and not self._grow()
             ):
                 status = Status.MEMORY
-            elif counters[kernels.NUM_BOXES] >= max_boxes:
+            elif self._state.counters[kernels.NUM_BOXES] >= max_boxes:
                 status = Status.BOXES
             elif self._is_late():
                 status = Status.TIME
-            if progress:
-                progress(self._progress(stage))
-            if status is None and is_cancelled and is_cancelled():
+            self._tell()
+            if status is None and self._is_cancelled and self._is_cancelled():
                 status = Status.CANCELLED
             if status is not None:
                 return status
 
-    def _run_chunk(self, max_boxes: int, apart: float) -> None:
-        p, settings = self._problem, self._settings
-        kernels.run(
-            p.points, p.rows, p.frames, p.levels, p.level_of, p.half_of,
-            p.coefficients, p.bounds, p.windows, p.curvatures, p.window,
-            p.arm, p.reach, p.margin, p.small, settings.gap, settings.keep, apart, max_boxes,
-            self._boxes, self._keys, self._heap, self._counters, self._best, self._found,
-            self._worth,
-        )  # fmt: skip
+    def _is_over(self) -> bool:
+        return self._is_late() or bool(self._is_cancelled and self._is_cancelled())
+
+    def _is_late(self) -> bool:
+        clock = self._clock
+        return clock is not None and clock() - self._start_s >= self._settings.max_seconds
 
     def _grow(self) -> bool:
         """Double the room for open boxes, within the memory allowed."""
-        slots = len(self._heap)
+        state, slots = self._state, len(self._state.heap)
         wanted = min(2 * slots, self._max_slots)
         if wanted <= slots:
             return False
         extra = wanted - slots
-        self._boxes = np.concatenate([self._boxes, np.empty((extra, 7))])
-        self._keys = np.concatenate([self._keys, np.empty(extra)])
-        self._heap = np.concatenate([self._heap, np.arange(slots, wanted, dtype=np.int32)])
+        self._state = state._replace(
+            boxes=np.concatenate([state.boxes, np.empty((extra, 7))]),
+            keys=np.concatenate([state.keys, np.empty(extra)]),
+            heap=np.concatenate([state.heap, np.arange(slots, wanted, dtype=np.int32)]),
+        )
         return True
 
     def _bounds(self) -> tuple[float, float]:
-        lower = float(self._best[0]) - self._problem.margin
-        return lower, max(self._top(), float(self._best[0]) + self._problem.margin)
+        best, margin = float(self._state.best[0]), self._problem.margin
+        return best - margin, max(self._top(), self._dropped, best + margin)
 
     def _top(self) -> float:
         """Largest bound of an open box."""
-        num_open = int(self._counters[kernels.NUM_OPEN])
-        return float(self._keys[self._heap[0]]) if num_open else -math.inf
+        state = self._state
+        is_open = state.counters[kernels.NUM_OPEN] > 0
+        return float(state.keys[state.heap[0]]) if is_open else -math.inf
 
-    def _progress(self, stage: str) -> Progress:
-        lower, upper = self._bounds()
-        counters = self._counters
-        pose = self._problem.to_pose(*self._best[1:4])
-        return Progress(
-            stage,
-            lower,
-            upper,
-            int(counters[kernels.NUM_BOXES]),
-            int(counters[kernels.NUM_OPEN]),
-            pose,
-        )
+    def _tell(self) -> None:
+        if self._progress:
+            num_open, num_boxes, _ = self._state.counters.tolist()
+            pose = self._problem.to_pose(*self._state.best[1:4])
+            self._progress(Progress(self._stage, *self._bounds(), num_boxes, num_open, pose))
 
     def _outcome(
         self, status: Status, lower: float, upper: float, has_all_rivals: bool
     ) -> SearchOutcome:
-        p, counters = self._problem, self._counters
-        value, pose = p.ascend(self._best[1:4])
-        if value > self._best[0]:
-            self._best[0], self._best[1:4] = value, pose
-        lower = float(self._best[0]) - p.margin
-        upper = max(upper, float(self._best[0]) + p.margin)
-        found = self._found[: int(counters[kernels.NUM_FOUND])]
-        found = np.vstack([[*self._best[:4], -math.inf], found])
+        p, (_, _, _, _, best, found, _) = self._problem, self._state
+        num_open, num_boxes, num_found = self._state.counters.tolist()
+        value, pose = p.ascend(best[1:4])
+        if value > best[0]:
+            best[0], best[1:4] = value, pose
+        lower = float(best[0]) - p.margin
+        upper = max(upper, float(best[0]) + p.margin)
+        found = np.vstack([[*best[:4], -math.inf], found[:num_found]])
         found = found[np.argsort(-found[:, 0], kind="stable")]
-        neighborhoods = Neighborhoods.of(
-            p, found, max(self._top(), self._floor()), float(self._best[5])
-        )
+        undecided = max(self._top(), self._floor() + p.margin, self._dropped)
+        neighborhoods = Neighborhoods.of(p, found, undecided, float(best[5]))
         distinct = found[neighborhoods.apart_from_better(0.2 * p.reach)]
         poses = [p.to_pose(*row[1:4]) for row in distinct]
         return SearchOutcome(
-            T_target_source=p.to_pose(*self._best[1:4]),
+            T_target_source=p.to_pose(*best[1:4]),
+            pose=best[1:4].copy(),
             lower_bound=lower,
             upper_bound=upper,
             status=status,
-            num_boxes=int(counters[kernels.NUM_BOXES]),
+            num_boxes=num_boxes,
             num_cells=self._num_cells,
-            num_open_boxes=int(counters[kernels.NUM_OPEN]),
-            seconds=self._clock() - self._start if self._clock else math.nan,
+            num_open_boxes=num_open,
+            seconds=self._clock() - self._start_s if self._clock else math.nan,
             optima=np.array(
                 [[v, t.x, t.y, t.yaw] for v, t in zip(distinct[:, 0], poses, strict=True)]
             ),
@@ -329,4 +330,12 @@ class _Search:
             upper_elsewhere=min(upper, neighborhoods.upper_elsewhere),
             has_all_rivals=has_all_rivals,
             neighborhoods=neighborhoods,
+            open_poses=self._open_poses() if status is not Status.CERTIFIED else np.empty((0, 3)),
         )
+
+    def _open_poses(self) -> FloatArray:
+        """Middles of the most promising open boxes."""
+        state = self._state
+        slots = state.heap[: int(state.counters[kernels.NUM_OPEN])]
+        order = np.argsort(-state.keys[slots], kind="stable")[:_NUM_OPEN_POSES]
+        return state.boxes[slots[order], :3]

@@ -6,9 +6,8 @@ second derivatives are bounded cell by cell. So three questions have quick answe
 and not estimates:
 
 * the value at a point (nine coefficients),
-* an upper bound of the field over a rectangle (one look-up in a range-maximum pyramid),
-* an upper bound of its second derivative, in any direction, over a rectangle (one look-up in
-  another one).
+* an upper bound of the field over a rectangle (four look-ups in a table of range maxima),
+* an upper bound of its second derivative, in any direction, over a rectangle (in another one).
 
 What the field *means* is free: a Gaussian mixture (`mixture_field`), the logarithm of a likelihood
 ratio (`likelihood_field`), or walls positive and free space negative sampled from a grid
@@ -26,119 +25,105 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.registration.search import field_kernels
+from uw_dslam_ros2.core.registration.search import field_kernels, kernels
 
-__all__ = ["FIRST_LEVEL", "Field", "field_from_samples", "likelihood_field", "mixture_field"]
+__all__ = [
+    "NUM_WINDOWS",
+    "Field",
+    "field_from_samples",
+    "likelihood_field",
+    "mixture_field",
+]
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
 
 _BORDER = 3  # zero coefficients around the content, so that the spline itself ends at zero
 _TAIL_SIGMAS = 6.0
 _BINS = 10  # on either side of a centre; beyond, a Gaussian is next to nothing
-_NUM_WINDOWS = 6  # exact maxima up to 63 cells; beyond, windows that are a little too large
-FIRST_LEVEL = _NUM_WINDOWS  # of the pyramid, in powers of two
+NUM_WINDOWS = 6
+"""Of a table: exact maxima over rectangles of up to 63 cells a side."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Field:
     """A biquadratic B-spline over the plane, with its bound tables.
 
     ``coefficients[row, col]`` belongs to the node ``origin + (col, row) * pitch_m``; the nodes'
     own squares are the cells of the tables. Float32, and *exactly* what is searched: nothing is
-    rounded afterwards.
+    rounded afterwards. The outermost three nodes are zero.
     """
 
     origin: FloatArray  # (2,), [m], node (0, 0)
     pitch_m: float
     coefficients: Float32Array  # (R, C)
-    error: float  # proven bound of |spline - its formula|; 0 where the spline is the definition
-    bounds: Float32Array  # flat, the maximum pyramid from 64 x 64 cells on
-    windows: Float32Array  # (6, R, C): largest value in 2^k x 2^k cells from each cell on
-    curvatures: Float32Array  # (6, R, C): largest second derivative [1 / m^2] in 2^k x 2^k cells
-    levels: IntArray  # (L, 3): offset, number of columns, right-shift of a cell index, from 64 on
+    error: float = 0.0  # proven bound of |spline - its formula|; 0 where the spline defines it
+
+    @functools.cached_property
+    def tables(self) -> tuple[Float32Array, Float32Array]:
+        """Largest values and largest second derivatives [1 / m^2], made when first asked for.
+
+        Both (6, R, C), in 2^k x 2^k cells, the squares around the nodes, from each cell on.
+        """
+        shape = NUM_WINDOWS, *self.coefficients.shape
+        windows, curvatures = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        field_kernels.fill_first_level(
+            self.coefficients, 1.0 / self.pitch_m**2, windows[0], curvatures[0]
+        )
+        field_kernels.fill_windows(windows)
+        field_kernels.fill_windows(curvatures)
+        return windows, curvatures
+
+    @functools.cached_property
+    def maximum(self) -> float:
+        """Upper bound over the whole plane: a spline stays within its coefficients' range."""
+        return max(float(self.coefficients.max()), 0.0)
 
     @property
-    def maximum(self) -> float:
-        """Upper bound over the whole plane."""
-        return max(float(self.bounds[self.levels[-1, 0]]), 0.0)
+    def high(self) -> FloatArray:
+        """Last node (2,) [m]."""
+        return self.origin + self.pitch_m * (np.array(self.coefficients.shape)[::-1] - 1)
 
     @property
     def num_bytes(self) -> int:
-        """Memory of all tables."""
-        return (
-            self.coefficients.nbytes
-            + self.bounds.nbytes
-            + self.windows.nbytes
-            + self.curvatures.nbytes
-        )
+        """Memory of the coefficients and both tables."""
+        return self.coefficients.nbytes * (1 + 2 * NUM_WINDOWS)
 
     def values(self, points: ArrayLike) -> FloatArray:
         """Values (N,) at points (N, 2) [m]."""
-        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+        return self._splines(points)[:, 0]
+
+    def slopes(self, points: ArrayLike) -> FloatArray:
+        """Slopes (N, 2) [1 / m] at points (N, 2) [m]."""
+        return self._splines(points)[:, 1:] / self.pitch_m
+
+    def _splines(self, points: ArrayLike) -> FloatArray:
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         nodes = (points - self.origin) / self.pitch_m
-        return field_kernels.spline_values(self.coefficients, nodes)
+        return kernels.spline_values(self.coefficients, nodes)
 
-    def upper_bound(self, low: ArrayLike, high: ArrayLike) -> float:
-        """Proven upper bound over the rectangle from `low` (2,) to `high` (2,) [m]."""
-        cells = self._cells(low, high)
-        if cells is None:
-            return 0.0
-        value = _largest(self.windows, *cells)
-        if value is not None:
-            return value
-        col, row, last_col, last_row = cells
-        for level, (offset, num_cols, shift) in enumerate(self.levels, FIRST_LEVEL):
-            if max(last_col - col, last_row - row) <= (1 << level) - (1 << shift):
-                return float(self.bounds[offset + (row >> shift) * num_cols + (col >> shift)])
-        return math.inf
+    def refined(self) -> Field:
+        """The same function on a lattice twice as fine, by Chaikin's knot insertion.
 
-    def curvature_bound(self, low: ArrayLike, high: ArrayLike) -> float:
-        """Proven upper bound of the second derivative in any direction [1 / m^2].
-
-        Infinite where the rectangle is larger than the tables go.
+        Its cells are the halves of the coarse ones, so the bounds are closer.
         """
-        cells = self._cells(low, high)
-        if cells is None:
-            return 0.0
-        value = _largest(self.curvatures, *cells)
-        return math.inf if value is None else value
-
-    def _cells(self, low: ArrayLike, high: ArrayLike) -> tuple[int, int, int, int] | None:
-        """First column and row, last column and row that a rectangle touches."""
-        num_rows, num_cols = self.coefficients.shape
-        first = np.floor((np.asarray(low) - self.origin) / self.pitch_m + 0.5 - 1e-9).astype(int)
-        last = np.floor((np.asarray(high) - self.origin) / self.pitch_m + 0.5 + 1e-9).astype(int)
-        if (last < 0).any() or first[0] >= num_cols or first[1] >= num_rows:
-            return None
-        first = np.maximum(first, 0)
-        last = np.minimum(last, [num_cols - 1, num_rows - 1])
-        return int(first[0]), int(first[1]), int(last[0]), int(last[1])
+        c = self.coefficients
+        for axis in (0, 1):
+            p = np.pad(c, [(1, 1) if k == axis else (0, 0) for k in (0, 1)])
+            before = p[:-2] if axis == 0 else p[:, :-2]
+            after = p[2:] if axis == 0 else p[:, 2:]
+            near, far = np.float32(0.75), np.float32(0.25)
+            pair = np.stack([near * c + far * before, near * c + far * after], axis=axis + 1)
+            c = pair.reshape(c.shape[0] * (2 - axis), c.shape[1] * (1 + axis))
+        origin = self.origin - 0.25 * self.pitch_m
+        return Field(origin, 0.5 * self.pitch_m, np.ascontiguousarray(c), self.error)
 
 
-def _largest(
-    windows: Float32Array, col: int, row: int, last_col: int, last_row: int
-) -> float | None:
-    """Largest value in a rectangle of cells, None where that is larger than the windows go."""
-    span = max(last_col - col, last_row - row)
-    spans = window_spans()
-    if span >= len(spans):
-        return None
-    size = 1 << int(spans[span])
-    rows, cols = [row, max(row, last_row - size + 1)], [col, max(col, last_col - size + 1)]
-    return float(windows[spans[span]][np.ix_(rows, cols)].max())
-
-
-def field_from_samples(
-    samples: ArrayLike, origin: ArrayLike, pitch_m: float, *, is_interpolated: bool = False
-) -> Field:
+def field_from_samples(samples: ArrayLike, origin: ArrayLike, pitch_m: float) -> Field:
     """Field whose lattice holds `samples` (R, C), any sign, at ``origin + (col, row) * pitch_m``.
 
-    The spline through the samples as coefficients is their smooth average: it stays within their
-    range. With ``is_interpolated`` it follows the samples closely instead (third order in the
-    pitch), and may leave their range a little. Either way the spline is the objective, and beyond
-    the samples (after one and a half cells) it is zero.
+    The spline with the samples as coefficients is their smooth average and stays within their
+    range. It is the objective, and beyond the samples (after one and a half cells) it is zero.
     """
     values = np.asarray(samples, dtype=np.float64)
     if values.ndim != 2 or values.size == 0:
@@ -148,12 +133,8 @@ def field_from_samples(
     if not (math.isfinite(pitch_m) and pitch_m > 0.0):
         raise InvalidInputError(f"pitch_m is {pitch_m}, expected a positive number")
     padded = np.pad(values, _BORDER)
-    if is_interpolated:
-        padded = _interpolating(padded)
-        padded[[0, 1, -2, -1], :] = 0.0
-        padded[:, [0, 1, -2, -1]] = 0.0
     node = np.asarray(origin, dtype=np.float64) - _BORDER * pitch_m
-    return _with_tables(padded.astype(np.float32), node, pitch_m, 0.0)
+    return Field(node, pitch_m, padded.astype(np.float32))
 
 
 def mixture_field(
@@ -187,7 +168,7 @@ def mixture_field(
     coefficients = samples.astype(np.float32)
     error = _mixture_error(centers, weights, sigmas_m, pitch_m)
     error += float(np.abs(coefficients).max()) * 2.0**-23
-    return _with_tables(coefficients, low, pitch_m, error)
+    return Field(low, pitch_m, coefficients, error)
 
 
 def likelihood_field(
@@ -216,12 +197,7 @@ def likelihood_field(
     coefficients = _interpolating(samples)
     coefficients[[0, 1, -2, -1], :] = 0.0
     coefficients[:, [0, 1, -2, -1]] = 0.0
-    return _with_tables(coefficients.astype(np.float32), low, pitch_m, 0.0)
-
-
-def window_spans() -> NDArray[np.int8]:
-    """For every span, the level of which two overlapping windows hold exactly span + 1 cells."""
-    return np.log2(np.arange(1, 1 << _NUM_WINDOWS)).astype(np.int8)
+    return Field(low, pitch_m, coefficients.astype(np.float32))
 
 
 def _lattice(
@@ -294,37 +270,3 @@ def _largest_derivatives(distance: FloatArray) -> tuple[FloatArray, FloatArray]:
     third = np.abs(beyond**3 - 3.0 * beyond) * gauss
     fourth = np.abs(beyond**4 - 6.0 * beyond**2 + 3.0) * gauss
     return 1.001 * third.max(axis=1), 1.001 * fourth.max(axis=1)
-
-
-def _with_tables(
-    coefficients: Float32Array, origin: FloatArray, pitch_m: float, error: float
-) -> Field:
-    num_rows, num_cols = coefficients.shape
-    levels = []
-    offset, level = 0, FIRST_LEVEL
-    while True:
-        shift = level - 2
-        rows, cols = ((num_rows - 1) >> shift) + 1, ((num_cols - 1) >> shift) + 1
-        levels.append((offset, cols, shift))
-        offset += rows * cols
-        if (1 << level) - (1 << shift) >= max(num_rows, num_cols):
-            break
-        level += 1
-    table = np.array(levels, dtype=np.int64)
-    bounds = np.empty(offset, dtype=np.float32)
-    windows = np.empty((_NUM_WINDOWS, num_rows, num_cols), dtype=np.float32)
-    curvatures = np.empty((_NUM_WINDOWS, num_rows, num_cols), dtype=np.float32)
-    field_kernels.fill_first_level(coefficients, 1.0 / pitch_m**2, windows[0], curvatures[0])
-    field_kernels.fill_windows(windows)
-    field_kernels.fill_windows(curvatures)
-    field_kernels.fill_pyramid(windows[-1], bounds, table)
-    return Field(
-        np.asarray(origin, dtype=np.float64),
-        pitch_m,
-        coefficients,
-        error,
-        bounds,
-        windows,
-        curvatures,
-        table,
-    )

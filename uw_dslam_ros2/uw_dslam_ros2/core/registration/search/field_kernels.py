@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs
-"""Compiled parts of the fields: sampling Gaussians, spline values, bound tables."""
+"""Compiled parts of the fields: sampling Gaussians, bound tables."""
 
 from __future__ import annotations
 
@@ -8,28 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["add_gaussians", "fill_first_level", "fill_pyramid", "fill_windows", "spline_values"]
-
-
-@njit(cache=True, nogil=True)
-def spline_values(coefficients, nodes):
-    """Values (N,) at positions (N, 2) in units of the lattice."""
-    num_rows, num_cols = coefficients.shape
-    values = np.zeros(nodes.shape[0])
-    for k in range(nodes.shape[0]):
-        u, v = nodes[k, 0], nodes[k, 1]
-        if not (0.5 <= u < num_cols - 1.5 and 0.5 <= v < num_rows - 1.5):
-            continue
-        i, j = math.floor(u + 0.5), math.floor(v + 0.5)
-        a, b = u - i, v - j
-        wa = (0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2)
-        wb = (0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2)
-        for row in range(3):
-            line = 0.0
-            for col in range(3):
-                line += wa[col] * coefficients[j + row - 1, i + col - 1]
-            values[k] += wb[row] * line
-    return values
+__all__ = ["add_gaussians", "fill_first_level", "fill_windows"]
 
 
 @njit(cache=True, nogil=True)
@@ -107,31 +86,6 @@ def fill_first_level(coefficients, scale, bounds, curvatures):
             largest = scale * (0.5 * (fxx + fyy) + math.sqrt(half * half + fxy * fxy))
             slack = scale * (abs(c) + abs(n) + abs(s) + abs(e) + abs(w)) * 2.0**-45
             curvatures[row, col] = np.float32(largest + abs(largest) * (up - 1.0) + slack)
-
-
-@njit(cache=True, nogil=True)
-def fill_pyramid(window, table, levels):
-    """Each window is the union of four half as wide, one level below; the first of ``window``s."""
-    num_rows, num_cols = window.shape
-    below_shift, half = 0, 1 << (levels[0, 2] + 1)
-    below = window.ravel()
-    below_rows, below_cols = num_rows, num_cols
-    for level in range(levels.shape[0]):
-        offset, cols, shift = levels[level, 0], levels[level, 1], levels[level, 2]
-        rows = ((num_rows - 1) >> shift) + 1
-        step, ahead = 1 << (shift - below_shift), half >> below_shift
-        for row in range(rows):
-            top = row * step
-            bottom = min(top + ahead, below_rows - 1)
-            for col in range(cols):
-                left = col * step
-                right = min(left + ahead, below_cols - 1)
-                table[offset + row * cols + col] = max(
-                    max(below[top * below_cols + left], below[top * below_cols + right]),
-                    max(below[bottom * below_cols + left], below[bottom * below_cols + right]),
-                )
-        below = table[offset : offset + rows * cols]
-        below_rows, below_cols, below_shift, half = rows, cols, shift, 2 * half
 
 
 @njit(cache=True, nogil=True)

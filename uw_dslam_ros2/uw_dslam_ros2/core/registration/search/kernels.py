@@ -1,15 +1,6 @@
 # mypy: allow-untyped-defs
 """Compiled heart of the search: bounds of boxes, local ascent, the best-first loop over a heap.
 
-Everything is flat arrays. ``points`` (4, K) hold x, y, weight, and the most that all later points
-can bring; ``terms`` (T, 8) integers: first point, end point, is_inverse, offset of the
-coefficients, rows, columns, first level, offset of the windows and curvatures; ``frames`` (T, 4):
-origin x, y, pitch, and rounding of a place in cells; ``levels`` (L, 3): offset of the bounds,
-columns, shift, of all fields after each other; ``level_of[span]``: the level whose windows hold
-``span + 1`` cells wherever they start; ``half_of[span]``: that of which two overlapping windows
-hold them exactly. ``heap`` holds every slot of ``boxes`` once: the open ones as a binary heap by
-``keys``, behind them the free ones.
-
 A box is (theta, x, y, half theta, half x, half y). The motion is ``p = R(theta) x + t`` for a
 forward term and ``p = R(theta)^T (y - t)`` for an inverse one.
 
@@ -20,20 +11,80 @@ file only, and would go on using an old version of what it calls in another.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-__all__ = ["UNSEEN", "ascend", "bound_first", "bound_second", "climb", "evaluate", "run"]
+__all__ = [
+    "UNSEEN",
+    "Bounds",
+    "State",
+    "Sum",
+    "ascend",
+    "bound_first",
+    "bound_second",
+    "climb",
+    "evaluate",
+    "follow_rivals",
+    "prove",
+    "spline_values",
+]
 
 # In place of the axis to split: a box of a sweep, which curvature has not looked at.
 UNSEEN = 3
 # Slots of the search's counters, and what it stopped for.
-NUM_OPEN, NUM_BOXES, NUM_SECOND, NUM_FOUND, STATUS = range(5)
+NUM_OPEN, NUM_BOXES, NUM_FOUND = range(3)
 DONE, CHUNK_ENDED, HEAP_FULL, FOUND_FULL = range(4)
 
+_NUM_SPANS = (
+    63  # two windows of the last level hold so many cells; beyond, the highest value counts
+)
 _LEARNING = 1.0 / 16.0
 _BOXES_PER_CLIMB = 10  # what one costs
+_NEAR = 0.2  # of the reach: optima nearer than that are one
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+
+
+class Sum(NamedTuple):
+    """The terms as flat arrays, and where their sum is looked at."""
+
+    points: FloatArray  # (4, K): x, y, weight, and the most that all later points can bring
+    # (T, 7): first point, end point, is_inverse, offset of the coefficients, rows, columns, offset
+    # of the windows and curvatures
+    terms: IntArray
+    frames: FloatArray  # (T, 5): origin x, y, pitch, rounding of a place in cells, highest value
+    coefficients: Float32Array  # of all fields
+    window: FloatArray  # (6,), a box
+    arm: float  # a turn moves the mean point by it [m]
+    reach: float  # of an optimum's surroundings [m]
+
+
+class Bounds(NamedTuple):
+    """What bounds are read from, of all fields after each other."""
+
+    windows: Float32Array  # largest values in 2^k x 2^k cells from each cell on
+    curvatures: Float32Array  # the same of second derivatives [1 / m^2]
+    margin: float  # for what rounding may take off a sum
+    small: float  # reach [m] of a box up to which curvature is tried
+
+
+class State(NamedTuple):
+    """A running search."""
+
+    boxes: FloatArray  # (S, 7), the last is the axis to split
+    keys: FloatArray  # (S,), their bounds
+    heap: NDArray[np.int32]  # every slot once: the open boxes as a binary heap, then the free ones
+    counters: IntArray
+    # (6,): lower bound, theta, x, y, ratio to the best from which on a centre is climbed from,
+    # largest bound of a box that led to an optimum from outside its neighbourhood
+    best: FloatArray
+    found: FloatArray  # (F, 5): optima met: value, theta, x, y, largest bound of their boxes
+    worth: FloatArray  # by size of a box: share of the way to the lower bound that curvature went
 
 
 @njit(cache=True, nogil=True)
@@ -85,87 +136,51 @@ def _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells):
 
 
 @njit(cache=True, nogil=True)
-def bound_first(
-    points, terms, frames, levels, level_of, half_of, bounds, windows, box, floor, cells
-):
+def bound_first(total, windows, box, floor, cells):
     """Upper bound over a box: every point at the best place that it can reach.
 
     Ends early, with a bound that is still true, once the other points cannot lift it over `floor`.
+    ``cells`` (4, K) of int32 is scratch.
     """
-    total = 0.0
+    points, terms, frames, upper = total.points, total.terms, total.frames, 0.0
     cos, sin, swing, bow = _turn(box)
     for t in range(terms.shape[0]):
-        first, num_cols, plane = terms[t, 0], terms[t, 5], terms[t, 4] * terms[t, 5]
-        at_windows = terms[t, 7]
+        first, count = terms[t, 0], terms[t, 1] - terms[t, 0]
         _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells)
-        count = terms[t, 1] - first
-        if _find_corners(cells, count, num_cols, plane, half_of.shape[0]):
-            lows, rights, ups = cells[0], cells[1], cells[2]
-            for k in range(count):
-                total += points[2, first + k] * _largest_of(
-                    windows, at_windows + lows[k], rights[k], ups[k]
-                )
-                if k & 15 == 15 and total + points[3, first + k] <= floor:
-                    return total + points[3, first + k]
-            continue
+        _find_corners(cells, count, terms[t, 5], terms[t, 4] * terms[t, 5])
+        lows, rights, ups = cells[0], cells[1], cells[2]
         for k in range(count):
-            i0, j0 = np.int64(cells[0, k]), np.int64(cells[1, k])
-            i1, j1 = np.int64(cells[2, k]), np.int64(cells[3, k])
-            span = max(i1 - i0, j1 - j0)
-            if span < half_of.shape[0]:
-                value = _largest(windows, at_windows, plane, num_cols, half_of, i0, j0, i1, j1)
-            else:
-                row = terms[t, 6] + level_of[span]
-                shift = levels[row, 2]
-                at = levels[row, 0] + (j0 >> shift) * levels[row, 1] + (i0 >> shift)
-                value = bounds[np.uint64(at)]
-            total += points[2, first + k] * value
-            if k & 15 == 15 and total + points[3, first + k] <= floor:
-                return total + points[3, first + k]
-    return total
+            value = frames[t, 4]
+            if lows[k] >= 0:
+                value = _largest_of(windows, terms[t, 6] + lows[k], rights[k], ups[k])
+            upper += points[2, first + k] * value
+            if k & 15 == 15 and upper + points[3, first + k] <= floor:
+                return upper + points[3, first + k]
+    return upper
 
 
 @njit(cache=True, nogil=True)
-def _largest(windows, at, plane, num_cols, half_of, i0, j0, i1, j1):
-    """Exact maximum over a rectangle of cells, from four overlapping windows.
-
-    Unsigned indices, for numba asks of signed ones whether they count from the end.
-    """
-    level = np.int64(half_of[np.uint64(max(i1 - i0, j1 - j0))])
-    size = 1 << level
-    at += level * plane
-    right, top = max(i1 - size + 1, i0), max(j1 - size + 1, j0)
-    low, high = at + j0 * num_cols, at + top * num_cols
-    return max(
-        max(windows[np.uint64(low + i0)], windows[np.uint64(low + right)]),
-        max(windows[np.uint64(high + i0)], windows[np.uint64(high + right)]),
-    )
-
-
-@njit(cache=True, nogil=True)
-def _find_corners(cells, count, num_cols, plane, num_spans):
+def _find_corners(cells, count, num_cols, plane):
     """Replace rectangles of cells by where their four windows are: the first, steps to the others.
 
-    Without branches, as above. False, and nothing is replaced, where one is too large.
+    Without branches, as above. Where one is too large for the windows, -1 stands for the first.
+    Returns whether none is.
     """
     i0s, j0s, i1s, j1s = cells[0], cells[1], cells[2], cells[3]
-    largest = np.int32(0)
-    for k in range(count):
-        largest = max(largest, max(i1s[k] - i0s[k], j1s[k] - j0s[k]))
-    if largest >= num_spans:
-        return False
     cols, size_of_table = np.int32(num_cols), np.int32(plane)
+    largest = np.int32(0)
     for k in range(count):
         i0, j0 = i0s[k], j0s[k]
         width, height = i1s[k] - i0, j1s[k] - j0
         span = max(width, height)
+        largest = max(largest, span)
         level = np.int32(span >= 1) + np.int32(span >= 3) + np.int32(span >= 7)
         level += np.int32(span >= 15) + np.int32(span >= 31)
         more = (1 << level) - 1
-        i0s[k] = level * size_of_table + j0 * cols + i0
+        i0s[k] = level * size_of_table + j0 * cols + i0 if span < _NUM_SPANS else np.int32(-1)
         j0s[k] = max(width - more, np.int32(0))
         i1s[k] = max(height - more, np.int32(0)) * cols
-    return True
+    return largest < _NUM_SPANS
 
 
 @njit(cache=True, nogil=True)
@@ -211,57 +226,11 @@ def _find_places(
         nodes[k] = np.int32((j - 1.0) * cols + i - 1.0)
 
 
-@njit(cache=True, nogil=True)
-def _fill_splines(coefficients, at, num_cols, scale, count, nodes, room):
-    """Weighted values and slopes of the field into ``room[5:8]``."""
-    at, cols = np.uint64(at), np.uint64(num_cols)
-    one, two, twice = np.uint64(1), np.uint64(2), np.uint64(2 * num_cols)
-    n00, n01, n02, n10, n11 = room[5], room[6], room[7], room[8], room[9]
-    n12, n20, n21, n22 = room[10], room[11], room[12], room[13]
-    for k in range(count):
-        low = at + np.uint64(nodes[k])
-        mid, high = low + cols, low + twice
-        n00[k], n01[k], n02[k] = (
-            coefficients[low],
-            coefficients[low + one],
-            coefficients[low + two],
-        )
-        n10[k], n11[k], n12[k] = (
-            coefficients[mid],
-            coefficients[mid + one],
-            coefficients[mid + two],
-        )
-        n20[k], n21[k] = coefficients[high], coefficients[high + one]
-        n22[k] = coefficients[high + two]
-    along, across, weights = room[2], room[3], room[4]
-    for k in range(count):
-        a, b, weight = along[k], across[k], weights[k]
-        a0, a1, a2 = 0.5 * (0.5 - a) * (0.5 - a), 0.75 - a * a, 0.5 * (0.5 + a) * (0.5 + a)
-        b0, b1, b2 = 0.5 * (0.5 - b) * (0.5 - b), 0.75 - b * b, 0.5 * (0.5 + b) * (0.5 + b)
-        c00, c01, c02, c10, c11 = n00[k], n01[k], n02[k], n10[k], n11[k]
-        c12, c20, c21, c22 = n12[k], n20[k], n21[k], n22[k]
-        line0 = a0 * c00 + a1 * c01 + a2 * c02
-        line1 = a0 * c10 + a1 * c11 + a2 * c12
-        line2 = a0 * c20 + a1 * c21 + a2 * c22
-        slope0 = (0.5 + a) * (c02 - c01) + (0.5 - a) * (c01 - c00)
-        slope1 = (0.5 + a) * (c12 - c11) + (0.5 - a) * (c11 - c10)
-        slope2 = (0.5 + a) * (c22 - c21) + (0.5 - a) * (c21 - c20)
-        rise = (0.5 + b) * (line2 - line1) + (0.5 - b) * (line1 - line0)
-        n00[k] = weight * (b0 * line0 + b1 * line1 + b2 * line2)
-        n01[k] = weight * scale * (b0 * slope0 + b1 * slope1 + b2 * slope2)
-        n02[k] = weight * scale * rise
-
-
-@njit(cache=True, nogil=True)
-def _spline(coefficients, at, num_cols, a, b):
-    """Value, slopes and second derivatives, in cells, of the spline at (a, b) from a node."""
-    a0, a1, a2 = 0.5 * (0.5 - a) ** 2, 0.75 - a * a, 0.5 * (0.5 + a) ** 2
-    b0, b1, b2 = 0.5 * (0.5 - b) ** 2, 0.75 - b * b, 0.5 * (0.5 + b) ** 2
-    low, mid, high = np.uint64(at), np.uint64(at + num_cols), np.uint64(at + 2 * num_cols)
-    one, two = np.uint64(1), np.uint64(2)
-    c00, c01, c02 = coefficients[low], coefficients[low + one], coefficients[low + two]
-    c10, c11, c12 = coefficients[mid], coefficients[mid + one], coefficients[mid + two]
-    c20, c21, c22 = coefficients[high], coefficients[high + one], coefficients[high + two]
+@njit(cache=True, nogil=True, inline="always")
+def _spline(a, b, c00, c01, c02, c10, c11, c12, c20, c21, c22):
+    """Value, slopes, second derivatives xx, xy, yy, in cells, at (a, b) from the node of c11."""
+    a0, a1, a2 = 0.5 * (0.5 - a) * (0.5 - a), 0.75 - a * a, 0.5 * (0.5 + a) * (0.5 + a)
+    b0, b1, b2 = 0.5 * (0.5 - b) * (0.5 - b), 0.75 - b * b, 0.5 * (0.5 + b) * (0.5 + b)
     line0 = a0 * c00 + a1 * c01 + a2 * c02
     line1 = a0 * c10 + a1 * c11 + a2 * c12
     line2 = a0 * c20 + a1 * c21 + a2 * c22
@@ -279,14 +248,76 @@ def _spline(coefficients, at, num_cols, a, b):
     )
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _spline_at(coefficients, at, num_cols, a, b):
+    """The same from the flat index of c00. Unsigned, for numba asks whether they are negative."""
+    low, mid, high = np.uint64(at), np.uint64(at + num_cols), np.uint64(at + 2 * num_cols)
+    one, two = np.uint64(1), np.uint64(2)
+    return _spline(
+        a, b, coefficients[low], coefficients[low + one], coefficients[low + two],
+        coefficients[mid], coefficients[mid + one], coefficients[mid + two],
+        coefficients[high], coefficients[high + one], coefficients[high + two],
+    )  # fmt: skip
+
+
 @njit(cache=True, nogil=True)
-def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, out, cells, room):
+def spline_values(coefficients, nodes):
+    """Values and slopes [1 / cell] (N, 3) of a field (R, C) at positions (N, 2) in cells."""
+    num_rows, num_cols = coefficients.shape
+    flat, values = coefficients.ravel(), np.zeros((nodes.shape[0], 3))
+    for k in range(nodes.shape[0]):
+        u, v = nodes[k, 0] + 0.5, nodes[k, 1] + 0.5
+        if 1.0 <= u < num_cols - 1 and 1.0 <= v < num_rows - 1:
+            i, j = int(u), int(v)
+            at = (j - 1) * num_cols + i - 1
+            values[k, 0], values[k, 1], values[k, 2], _, _, _ = _spline_at(
+                flat, at, num_cols, u - 0.5 - i, v - 0.5 - j
+            )
+    return values
+
+
+@njit(cache=True, nogil=True)
+def _fill_splines(coefficients, at, num_cols, scale, count, nodes, room):
+    """Weighted values and slopes of the field into ``room[5:8]``."""
+    at, cols = np.uint64(at), np.uint64(num_cols)
+    one, two, twice = np.uint64(1), np.uint64(2), np.uint64(2 * num_cols)
+    n00, n01, n02, n10, n11 = room[5], room[6], room[7], room[8], room[9]
+    n12, n20, n21, n22 = room[10], room[11], room[12], room[13]
+    # Fetched first and counted afterwards, which the compiler does with vector instructions.
+    for k in range(count):
+        low = at + np.uint64(nodes[k])
+        mid, high = low + cols, low + twice
+        n00[k], n01[k] = coefficients[low], coefficients[low + one]
+        n02[k], n10[k] = coefficients[low + two], coefficients[mid]
+        n11[k], n12[k] = coefficients[mid + one], coefficients[mid + two]
+        n20[k], n21[k] = coefficients[high], coefficients[high + one]
+        n22[k] = coefficients[high + two]
+    along, across, weights = room[2], room[3], room[4]
+    for k in range(count):
+        value, slope_x, slope_y, _, _, _ = _spline(
+            along[k], across[k], n00[k], n01[k], n02[k], n10[k], n11[k], n12[k], n20[k], n21[k],
+            n22[k],
+        )  # fmt: skip
+        weight = weights[k]
+        n00[k] = weight * value
+        n01[k] = weight * scale * slope_x
+        n02[k] = weight * scale * slope_y
+
+
+@njit(cache=True, nogil=True)
+def bound_second(total, curvatures, box, out, cells, room):
     """Upper bound over a small box from value, summed gradient and bounded curvature.
 
     ``out``: the bound, the value at the centre, and the rise that theta, x and y can bring. The
     bound is infinite where the box is too large for the tables. ``cells`` (4, K) of int32 and
     ``room`` (14, K) are scratch.
     """
+    points, terms, frames, coefficients = (
+        total.points,
+        total.terms,
+        total.frames,
+        total.coefficients,
+    )
     cos, sin, swing, bow = _turn(box)
     tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
     value = 0.0
@@ -296,7 +327,7 @@ def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, 
     for t in range(terms.shape[0]):
         is_inverse = terms[t, 2] != 0
         at_coefficients, num_rows, num_cols = terms[t, 3], terms[t, 4], terms[t, 5]
-        at_curvatures, plane = terms[t, 7], terms[t, 4] * terms[t, 5]
+        at_curvatures, plane = terms[t, 6], terms[t, 4] * terms[t, 5]
         scale = 1.0 / frames[t, 2]
         shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
         if not is_inverse:
@@ -305,7 +336,7 @@ def bound_second(points, terms, frames, half_of, coefficients, curvatures, box, 
         la, lx, ly, lc = 0.0, 0.0, 0.0, 0.0
         first, count = terms[t, 0], terms[t, 1] - terms[t, 0]
         _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells)
-        if not _find_corners(cells, count, num_cols, plane, half_of.shape[0]):
+        if not _find_corners(cells, count, num_cols, plane):
             return
         _find_places(
             points, first, count, is_inverse, cos, sin, tx, ty, scale, shift_x, shift_y,
@@ -379,8 +410,14 @@ def _parabola(slope, curvature, half_width):
 
 
 @njit(cache=True, nogil=True)
-def evaluate(points, terms, frames, coefficients, pose, gradient, hessian):
+def evaluate(total, pose, gradient, hessian):
     """Objective at a pose with its exact gradient and second derivatives, order theta, x, y."""
+    points, terms, frames, coefficients = (
+        total.points,
+        total.terms,
+        total.frames,
+        total.coefficients,
+    )
     cos, sin = math.cos(pose[0]), math.sin(pose[0])
     value = 0.0
     gradient[:] = 0.0
@@ -406,7 +443,7 @@ def evaluate(points, terms, frames, coefficients, pose, gradient, hessian):
                 continue
             i, j = int(u), int(v)
             at = at_coefficients + (j - 1) * num_cols + i - 1
-            field, fx, fy, fxx, fxy, fyy = _spline(
+            field, fx, fy, fxx, fxy, fyy = _spline_at(
                 coefficients, at, num_cols, u - 0.5 - i, v - 0.5 - j
             )
             first, second = weight * scale, weight * scale * scale
@@ -488,31 +525,30 @@ def _solve(matrix, damping, arm, right, step):
 
 
 @njit(cache=True, nogil=True)
-def ascend(
-    points, terms, frames, coefficients, window, arm, reach, pose, max_steps, precision, work
-):
+def ascend(total, longest, pose, max_steps, precision, work):
     """Climb from `pose` (theta, x, y) in place, within the window; damped Newton steps.
 
-    Ends where a step gains less than `precision` of the value. ``work`` (10, 3): scratch. Returns
-    the value reached.
+    A step moves the points by ``longest`` at most. Ends where one gains less than `precision` of
+    the value. ``work`` (10, 3): scratch. Returns the value reached.
     """
+    arm, window = total.arm, total.window
     gradient, next_gradient, step, trial = work[0], work[1], work[2], work[3]
     hessian, next_hessian = work[4:7], work[7:10]
-    value = evaluate(points, terms, frames, coefficients, pose, gradient, hessian)
+    value = evaluate(total, pose, gradient, hessian)
     damping = abs(hessian[1, 1]) + abs(hessian[2, 2]) + 1e-9
     for _ in range(max_steps):
         if not _solve(hessian, damping, arm, gradient, step):
             damping *= 4.0
             continue
         length = max(abs(step[0]) * arm, max(abs(step[1]), abs(step[2])))
-        if length > reach:
+        if length > longest:
             damping *= 3.0
             continue
         for k in range(3):
             trial[k] = min(
                 max(pose[k] + step[k], window[k] - window[k + 3]), window[k] + window[k + 3]
             )
-        found = evaluate(points, terms, frames, coefficients, trial, next_gradient, next_hessian)
+        found = evaluate(total, trial, next_gradient, next_hessian)
         if found > value:
             gain = found - value
             value = found
@@ -520,20 +556,22 @@ def ascend(
             gradient[:] = next_gradient
             hessian[:, :] = next_hessian
             damping *= 0.2
-            if gain <= precision * abs(value) or length < 1e-6 * reach:
+            if gain <= precision * abs(value) or length < 1e-6 * longest:
                 break
         else:
             damping *= 5.0
-            if length < 1e-5 * reach:
+            if length < 1e-5 * longest:
                 break
     return value
 
 
 @njit(cache=True, nogil=True)
-def _push(keys, heap, count, slot):
-    """Sift the box in `slot` up a heap of `count`, largest key first."""
-    k = count
-    key = keys[slot]
+def _put(state, box, axis, key):
+    """Add a box to the heap, largest key first."""
+    keys, heap, k = state.keys, state.heap, state.counters[NUM_OPEN]
+    slot = heap[k]
+    state.boxes[slot, :6] = box
+    state.boxes[slot, 6], keys[slot] = axis, key
     while k > 0:
         parent = (k - 1) >> 1
         if keys[heap[parent]] >= key:
@@ -541,23 +579,22 @@ def _push(keys, heap, count, slot):
         heap[k] = heap[parent]
         k = parent
     heap[k] = slot
+    state.counters[NUM_OPEN] += 1
 
 
 @njit(cache=True, nogil=True)
-def _pop(keys, heap, count):
-    """Take the best box off a heap of `count`; its slot joins the free ones behind the heap."""
-    top = heap[0]
-    last = heap[count - 1]
-    key = keys[last]
-    size = count - 1
-    k = 0
+def _take(state):
+    """Slot of the best box, taken off the heap; it is free now, and the next to be filled."""
+    state.counters[NUM_OPEN] -= 1
+    keys, heap, size = state.keys, state.heap, state.counters[NUM_OPEN]
+    top, last, k = heap[0], heap[size], 0
     while True:
         child = 2 * k + 1
         if child >= size:
             break
         if child + 1 < size and keys[heap[child + 1]] > keys[heap[child]]:
             child += 1
-        if keys[heap[child]] <= key:
+        if keys[heap[child]] <= keys[last]:
             break
         heap[k] = heap[child]
         k = child
@@ -579,61 +616,56 @@ def _axis_to_split(box, arm, out):
 
 
 @njit(cache=True, nogil=True)
-def _owner(found, count, theta, x, y, half_theta, half_x, half_y, arm, radius):
+def _owner(state, box, halves, arm, radius):
     """Best optimum in whose neighbourhood a box lies entirely, -1 if there is none."""
-    owner = -1
-    for k in range(count):
+    found, owner = state.found, -1
+    for k in range(state.counters[NUM_FOUND]):
         if owner >= 0 and found[k, 0] <= found[owner, 0]:
             continue
-        if abs(found[k, 2] - x) + half_x > radius:
+        if abs(found[k, 2] - box[1]) + halves[1] > radius:
             continue
-        if abs(found[k, 3] - y) + half_y > radius:
+        if abs(found[k, 3] - box[2]) + halves[2] > radius:
             continue
-        turn = abs(found[k, 1] - theta) % (2.0 * math.pi)
-        if arm * (min(turn, 2.0 * math.pi - turn) + half_theta) <= radius:
+        turn = abs(found[k, 1] - box[0]) % (2.0 * math.pi)
+        if arm * (min(turn, 2.0 * math.pi - turn) + halves[0]) <= radius:
             owner = k
     return owner
 
 
 @njit(cache=True, nogil=True)
-def _note(found, counters, value, pose, arm, radius):
+def _note(total, state, value, pose):
     """Index of an optimum in the list, added if it is new; -1 where the list is full."""
-    count = counters[NUM_FOUND]
-    k = _owner(found, count, pose[0], pose[1], pose[2], 0.0, 0.0, 0.0, arm, radius)
+    found, counters, best = state.found, state.counters, state.best
+    k = _owner(state, pose, np.zeros(3), total.arm, _NEAR * total.reach)
+    if value > best[0]:
+        best[0] = value
+        best[1:4] = pose
     if k < 0:
-        if count == found.shape[0]:
+        if counters[NUM_FOUND] == found.shape[0]:
             return -1
-        k = count
+        k = counters[NUM_FOUND]
         counters[NUM_FOUND] += 1
-        found[k, 0] = -math.inf
-        found[k, 4] = -math.inf
+        found[k, 0] = found[k, 4] = -math.inf
     if value > found[k, 0]:
         found[k, 0] = value
-        found[k, 1:4] = pose[:3]
+        found[k, 1:4] = pose
     return k
 
 
 @njit(cache=True, nogil=True)
-def _try_climb(
-    points, terms, frames, coefficients, window, arm, reach, value, box, best, found, counters,
-    work,
-):  # fmt: skip
+def _try_climb(total, state, value, box, work):
     """Climb from a centre of that value, unless it is poor or beside a known, better optimum."""
+    best = state.best
     if value <= best[0]:
         if value <= best[4] * best[0]:
             return
-        count = counters[NUM_FOUND]
-        if _owner(found, count, box[0], box[1], box[2], 0.0, 0.0, 0.0, arm, reach) >= 0:
+        if _owner(state, box, np.zeros(3), total.arm, total.reach) >= 0:
             return
-    pose = work[10]
+    pose, before = work[10], best[0]
     pose[:] = box[:3]
-    top = ascend(
-        points, terms, frames, coefficients, window, arm, reach, pose, 30, 1e-8, work[:10]
-    )
-    _note(found, counters, top, pose, arm, 0.2 * reach)
-    if top > best[0]:
-        best[0] = top
-        best[1:4] = pose
+    top = ascend(total, total.reach, pose, 30, 1e-8, work[:10])
+    _note(total, state, top, pose)
+    if top > before:
         best[4] = 0.3
     else:
         # The more climbs fail, the better a centre has to be for the next.
@@ -641,145 +673,157 @@ def _try_climb(
 
 
 @njit(cache=True, nogil=True)
-def climb(
-    points, terms, frames, coefficients, window, arm, reach, boxes, max_climbs, best, found,
-    counters,
-):  # fmt: skip
+def climb(total, state, boxes, max_climbs):
     """Climb from the best centres of some boxes (K, 6)."""
     work, values = np.empty((11, 3)), np.empty(boxes.shape[0])
     for k in range(boxes.shape[0]):
-        values[k] = evaluate(points, terms, frames, coefficients, boxes[k, :3], work[0], work[4:7])
-    order = np.argsort(-values)
-    for k in order[:max_climbs]:
-        _try_climb(
-            points, terms, frames, coefficients, window, arm, reach, values[k], boxes[k], best,
-            found, counters, work,
-        )  # fmt: skip
+        values[k] = evaluate(total, boxes[k, :3], work[0], work[4:7])
+    for k in np.argsort(-values)[:max_climbs]:
+        _try_climb(total, state, values[k], boxes[k], work)
 
 
 @njit(cache=True, nogil=True)
-def run(
-    points, terms, frames, levels, level_of, half_of, coefficients, bounds, windows, curvatures,
-    window, arm, reach, margin, small, gap, keep, radius, max_boxes,
-    boxes, keys, heap, counters, best, found, worth,
-):  # fmt: skip
-    """Search until the gap is closed or `max_boxes` more boxes were bounded.
+def _bound(total, bounds, state, box, key, is_unseen, keep, wanted, scratch):
+    """Upper bound of a box, at most ``key``, that of what it is part of.
 
-    ``best``: lower bound, theta, x, y, ratio to the best from which on a centre is climbed from,
-    largest bound of a box that led to an optimum from outside its neighbourhood. ``found``
-    (F, 5): optima met: value, theta, x, y, largest bound of the boxes counted to it. ``small``:
-    reach [m] of a box up to which curvature is tried; ``worth``: by size of the box, mean share
-    of the way down to the lower bound that it went.
-
-    Boxes are discarded once their bound is below ``keep`` times the lower bound. With ``radius``
-    = 0 the search ends when the gap is closed. With a positive one [m], every box above ``keep``
-    is followed until it is discarded or lies in the neighbourhood, of that radius, of an optimum;
-    what is still above as a box of a cell belongs to the optimum that a climb from there leads to.
+    Curvature is asked where it could take the bound below ``wanted``. Where it does not, the
+    centre may be worth a climb.
     """
-    out, work = np.empty(5), np.empty((11, 3))
-    child, pose = np.zeros(6), np.zeros(3)
-    cells, room = np.empty((4, points.shape[1]), np.int32), np.empty((14, points.shape[1]))
-    near = 0.2 * reach
-    budget = counters[NUM_BOXES] + max_boxes
-    counters[STATUS] = DONE
-    while counters[NUM_OPEN] > 0:
-        top = heap[0]
-        is_unseen = boxes[top, 6] == UNSEEN
-        if radius > 0.0:
-            if keys[top] <= keep * best[0]:
-                return
-            box = boxes[top]
-            owner = _owner(
-                found, counters[NUM_FOUND], box[0], box[1], box[2], box[3], box[4], box[5], arm,
-                radius,
-            )  # fmt: skip
-            # A box of a sweep is about that small, but not yet well bounded: it is split first.
-            size = max(box[3] * arm, max(box[4], box[5]))
-            is_small = not is_unseen and size <= 0.6 * near
-            if owner < 0 and is_small:
-                pose[:] = box[:3]
-                value = ascend(
-                    points, terms, frames, coefficients, window, arm, reach, pose, 50, 1e-6,
-                    work[:10],
-                )  # fmt: skip
-                owner = _note(found, counters, value, pose, arm, near)
-                if owner < 0:
-                    counters[STATUS] = FOUND_FULL
-                    return
-                counters[NUM_BOXES] += _BOXES_PER_CLIMB
-                if value > best[0]:
-                    best[0] = value
-                    best[1:4] = pose
-                best[5] = max(best[5], keys[top])
-            # Around the best, the bound of all is the bound; around others it is worth some boxes.
-            if owner >= 0 and (
-                is_small
-                or found[owner, 0] >= (1.0 - gap) * best[0]
-                or keys[top] * (1.0 - gap) <= found[owner, 0]
-            ):
-                found[owner, 4] = max(found[owner, 4], keys[top])
-                _pop(keys, heap, counters[NUM_OPEN])
-                counters[NUM_OPEN] -= 1
-                continue
-        elif keys[top] <= best[0] or keys[top] - best[0] <= gap * keys[top]:
-            return
-        if counters[NUM_BOXES] >= budget:
-            counters[STATUS] = CHUNK_ENDED
-            return
-        if counters[NUM_OPEN] + 2 > heap.shape[0]:
-            counters[STATUS] = HEAP_FULL
-            return
-        _pop(keys, heap, counters[NUM_OPEN])
-        counters[NUM_OPEN] -= 1
-        parent_key = keys[top]
-        axis = int(boxes[top, 6])
-        child[:] = boxes[top, :6]
-        centre = 0.0
+    out, work, cells, room = scratch
+    best, worth, margin = state.best, state.worth, bounds.margin
+    first = key
+    if not is_unseen:
+        floor = min(best[0], keep * best[0]) - margin
+        first = margin + bound_first(total, bounds.windows, box, floor, cells)
+    upper = min(key, first)
+    state.counters[NUM_BOXES] += 1
+    out[0] = math.inf
+    size = box[3] * total.arm + max(box[4], box[5])
+    if upper <= wanted or size > bounds.small:
+        return upper
+    level = min(int(2.0 * math.log2(bounds.small / max(size, 1e-300))), worth.shape[0] - 1)
+    # What seldom helps in boxes of that size is tried now and then only.
+    is_tried = is_unseen or wanted < best[0] or worth[level] > 0.7
+    if not is_tried and state.counters[NUM_BOXES] & 14 != 0:
+        return upper
+    bound_second(total, bounds.curvatures, box, out, cells, room)
+    gain = (first - max(out[0] + margin, wanted)) / (first - wanted)
+    worth[level] += _LEARNING * (max(gain, 0.0) - worth[level])
+    upper = min(upper, out[0] + margin)
+    if upper > wanted:
+        _try_climb(total, state, out[1], box, work)
+    if out[1] > best[0]:
+        best[0] = out[1]
+        best[1:4] = box[:3]
+    return upper
+
+
+@njit(cache=True, nogil=True)
+def _split(total, bounds, state, keep, is_proof, scratch):
+    """Replace the best box by its halves, as far as they can hold ``keep`` times the best value.
+
+    One of a sweep is looked at itself.
+    """
+    best, slot = state.best, _take(state)
+    key, axis, child = state.keys[slot], int(state.boxes[slot, 6]), state.boxes[slot, :6].copy()
+    is_unseen = axis == UNSEEN
+    if is_unseen:
+        num_parts, centre = 1, 0.0
+    else:
+        num_parts, centre = 2, child[axis]
+        child[axis + 3] *= 0.5
+    for part in range(num_parts):
         if not is_unseen:
-            child[axis + 3] *= 0.5
-            centre = child[axis]
-        for side in range(1 if is_unseen else 2):
-            floor = min(best[0], keep * best[0])
-            first = parent_key
-            if not is_unseen:
-                child[axis] = centre + (2 * side - 1) * child[axis + 3]
-                first = margin + bound_first(
-                    points, terms, frames, levels, level_of, half_of, bounds, windows, child,
-                    floor - margin, cells,
-                )  # fmt: skip
-            upper = min(parent_key, first)
-            counters[NUM_BOXES] += 1
-            out[0] = math.inf
-            size = child[3] * arm + max(child[4], child[5])
-            level = min(
-                int(2.0 * math.log2(max(small / max(size, 1e-300), 1.0))), worth.shape[0] - 1
-            )
-            # What seldom helps in boxes of that size is tried now and then only.
-            is_tried = radius > 0.0 or worth[level] > 0.7 or counters[NUM_BOXES] & 14 == 0
-            # In the first phase, what lies below the best is only kept for the second.
-            wanted = floor if radius > 0.0 else best[0]
-            if upper > wanted and size <= small and (is_tried or is_unseen):
-                bound_second(
-                    points, terms, frames, half_of, coefficients, curvatures, child, out, cells,
-                    room,
-                )  # fmt: skip
-                counters[NUM_SECOND] += 1
-                gain = (first - max(out[0] + margin, wanted)) / (first - wanted)
-                worth[level] += _LEARNING * (max(gain, 0.0) - worth[level])
-                upper = min(upper, out[0] + margin)
-                if upper > wanted:
-                    _try_climb(
-                        points, terms, frames, coefficients, window, arm, reach, out[1], child,
-                        best, found, counters, work,
-                    )  # fmt: skip
-                if out[1] > best[0]:
-                    best[0] = out[1]
-                    best[1:4] = child[:3]
-            if upper <= floor:
-                continue
-            slot = heap[counters[NUM_OPEN]]
-            boxes[slot, :6] = child
-            boxes[slot, 6] = _axis_to_split(child, arm, out)
-            keys[slot] = upper
-            _push(keys, heap, counters[NUM_OPEN], slot)
-            counters[NUM_OPEN] += 1
+            child[axis] = centre + (2 * part - 1) * child[axis + 3]
+        # While the best is to be proven, what lies below it is only kept for the rivals.
+        wanted = best[0] if is_proof else min(best[0], keep * best[0])
+        upper = _bound(total, bounds, state, child, key, is_unseen, keep, wanted, scratch)
+        if upper > min(best[0], keep * best[0]):
+            _put(state, child, _axis_to_split(child, total.arm, scratch[0]), upper)
+
+
+@njit(cache=True, nogil=True)
+def _limit(state, budget):
+    """Which limit keeps the next box from being split, if any."""
+    if state.counters[NUM_BOXES] >= budget:
+        return CHUNK_ENDED
+    return HEAP_FULL if state.counters[NUM_OPEN] + 2 > state.heap.shape[0] else DONE
+
+
+@njit(cache=True, nogil=True)
+def _make_scratch(total):
+    num_points = total.points.shape[1]
+    cells, room = np.empty((4, num_points), np.int32), np.empty((14, num_points))
+    return np.empty(5), np.empty((11, 3)), cells, room
+
+
+@njit(cache=True, nogil=True)
+def prove(total, bounds, state, gap, keep, max_boxes):
+    """Split the best box until the gap is closed, or `max_boxes` more boxes were bounded.
+
+    Boxes are discarded once their bound is below ``keep`` times the lower bound. Returns DONE, or
+    what it stopped for.
+    """
+    scratch, budget = _make_scratch(total), state.counters[NUM_BOXES] + max_boxes
+    while state.counters[NUM_OPEN] > 0:
+        key, best = state.keys[state.heap[0]], state.best[0]
+        if key <= best or key - best <= gap * key:
+            return DONE
+        limit = _limit(state, budget)
+        if limit != DONE:
+            return limit
+        _split(total, bounds, state, keep, True, scratch)
+    return DONE
+
+
+@njit(cache=True, nogil=True)
+def follow_rivals(total, bounds, state, gap, keep, radius, max_boxes):
+    """Follow every box above ``keep`` times the best, until it is excluded or an optimum's own.
+
+    It is an optimum's own if it lies in its neighbourhood, of that ``radius`` [m], or if a climb
+    from there, once it is as small as a cell, leads to that optimum.
+    """
+    scratch, budget = _make_scratch(total), state.counters[NUM_BOXES] + max_boxes
+    while state.counters[NUM_OPEN] > 0:
+        if state.keys[state.heap[0]] <= keep * state.best[0]:
+            return DONE
+        owner = _find_owner(total, state, gap, radius, scratch[1])
+        if owner == -2:
+            return FOUND_FULL
+        if owner >= 0:
+            slot = _take(state)
+            state.found[owner, 4] = max(state.found[owner, 4], state.keys[slot])
+            continue
+        limit = _limit(state, budget)
+        if limit != DONE:
+            return limit
+        _split(total, bounds, state, keep, False, scratch)
+    return DONE
+
+
+@njit(cache=True, nogil=True)
+def _find_owner(total, state, gap, radius, work):
+    """Optimum that the best box is counted to; -1 if it is to be split, -2 if there is no room."""
+    slot, best, found = state.heap[0], state.best, state.found
+    box, key = state.boxes[slot], state.keys[slot]
+    owner = _owner(state, box, box[3:6], total.arm, radius)
+    # A box of a sweep is about that small, but not yet well bounded: it is split first.
+    size = max(box[3] * total.arm, max(box[4], box[5]))
+    is_small = box[6] != UNSEEN and size <= 0.6 * _NEAR * total.reach
+    if owner < 0 and is_small:
+        pose = work[10]
+        pose[:] = box[:3]
+        value = ascend(total, total.reach, pose, 50, 1e-6, work[:10])
+        owner = _note(total, state, value, pose)
+        if owner < 0:
+            return -2
+        state.counters[NUM_BOXES] += _BOXES_PER_CLIMB
+        best[5] = max(best[5], key)
+    # Around the best, the bound of all is the bound; around others it is worth some boxes.
+    if owner >= 0 and (
+        is_small
+        or found[owner, 0] >= (1.0 - gap) * best[0]
+        or key * (1.0 - gap) <= found[owner, 0]
+    ):
+        return owner
+    return -1

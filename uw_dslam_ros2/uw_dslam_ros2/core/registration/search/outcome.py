@@ -44,6 +44,7 @@ class SearchOutcome:
     """Pose and proof. Bounds are sums over all terms, not normalised."""
 
     T_target_source: SE2
+    pose: FloatArray  # (3,), the same as theta, x, y of the problem
     lower_bound: float  # value at the pose, less the rounding margin
     upper_bound: float  # no pose of the window exceeds it
     status: Status
@@ -58,6 +59,12 @@ class SearchOutcome:
     upper_elsewhere: float  # no pose beyond all neighbourhoods exceeds it
     has_all_rivals: bool  # every pose above `keep` is in a neighbourhood, or uphill leads to one
     neighborhoods: Neighborhoods
+    open_poses: FloatArray  # (K, 3), middles of the most promising boxes that were left open
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the gap was closed."""
+        return self.status is Status.CERTIFIED
 
     def upper_bound_near(self, T_target_source: SE2) -> float:
         """Proven upper bound around a pose of the window: in its neighbourhood, or elsewhere."""

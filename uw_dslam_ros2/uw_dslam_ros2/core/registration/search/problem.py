@@ -5,6 +5,7 @@ A term is a set of weighted points and the `Field` they are scored in; see `bran
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.registration.search import kernels
-from uw_dslam_ros2.core.registration.search.field import FIRST_LEVEL, Field, window_spans
+from uw_dslam_ros2.core.registration.search.field import NUM_WINDOWS, Field
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["Problem", "Term", "as_points"]
@@ -52,67 +53,99 @@ class Term:
 
 
 class Problem:
-    """Terms as the kernels want them: flat arrays, both frames moved to their middle."""
+    """Terms as the kernels want them: flat arrays, both frames moved to their middle.
 
-    def __init__(self, terms: Sequence[Term], is_source_centred: bool = True) -> None:
+    Parameters
+    ----------
+    source_center, target_center : (2,)
+        Where the frames are moved to; the middle of what lies in them where None.
+    window : (6,)
+        Centre and half widths of (theta, x, y) to search; all at which anything can overlap where
+        None.
+    """
+
+    def __init__(
+        self,
+        terms: Sequence[Term],
+        source_center: FloatArray | None = None,
+        target_center: FloatArray | None = None,
+        window: FloatArray | None = None,
+    ) -> None:
         self.terms = [term for term in terms if len(term.points)]
         if not self.terms:
             raise InvalidInputError("a search needs at least one term with points, got none")
-        self.source_center = self._center(False) if is_source_centred else np.zeros(2)
-        self.target_center = self._center(True)
-        points, rows, frames, levels = [], [], [], []
-        num_points, num_levels, sizes = 0, 0, np.zeros(3, dtype=np.int64)
-        for term in self.terms:
-            own, others = self.source_center, self.target_center
-            if term.is_inverse:
-                own, others = others, own
-            field = term.field
-            points.append(np.column_stack([term.points - own, term.weights])[_shuffled(term)])
-            shape = field.coefficients.shape
-            rows.append(
-                [
-                    num_points,
-                    num_points + len(term.points),
-                    int(term.is_inverse),
-                    sizes[0],
-                    *shape,
-                    num_levels - FIRST_LEVEL,
-                    sizes[2],
-                ]
-            )
-            frames.append([*(field.origin - others), field.pitch_m])
-            table = field.levels + np.array([sizes[1], 0, 0])
-            levels.append(table)
-            num_points += len(term.points)
-            num_levels += len(table)
-            sizes += [field.coefficients.size, field.bounds.size, field.curvatures.size]
-        self.rows = np.array(rows, dtype=np.int64)
-        self.levels = np.ascontiguousarray(np.concatenate(levels))
-        self.coefficients = _joined([term.field.coefficients.ravel() for term in self.terms])
-        self.bounds = _joined([term.field.bounds for term in self.terms])
-        self.windows = _joined([term.field.windows.ravel() for term in self.terms])
-        self.curvatures = _joined([term.field.curvatures.ravel() for term in self.terms])
-        self.level_of = _level_table(int(self.rows[:, 4:6].max()))
-        self.half_of = window_spans()
-        self.window = self._window()
-        stacked = np.concatenate(points)
-        weights, spread = stacked[:, 2], (stacked[:, :2] ** 2).sum(axis=1)
-        self.points = np.vstack([stacked.T, self._rests(weights)])
-        rounding = self._rounding(frames, math.sqrt(float(spread.max())))
-        self.frames = np.column_stack([np.array(frames), rounding])
-        self.arm = math.sqrt(float((weights * spread).sum() / max(float(weights.sum()), 1e-300)))
-        self.arm = max([self.arm, *(self._turning_radius(t) for t in self.terms if t.is_inverse)])
+        self.source_center = self._center(False) if source_center is None else source_center
+        self.target_center = self._center(True) if target_center is None else target_center
+        self.window = self._window() if window is None else window
+        self.points = self._stacked()
+        weights, spread = self.points[2], (self.points[:2] ** 2).sum(axis=0)
+        self.frames = self._frames(math.sqrt(float(spread.max())))
+        self.rows = self._rows()
+        self.coefficients = _joined([term.field.coefficients for term in self.terms])
+        self.pitch_m = min(term.field.pitch_m for term in self.terms)
         self.reach = 5.0 * max(term.field.pitch_m for term in self.terms)
-        self.arm = max(self.arm, 1e-3 * self.reach)
+        self.arm = math.sqrt(float((weights * spread).sum() / max(float(weights.sum()), 1e-300)))
+        turning = [self._turning_radius(term) for term in self.terms if term.is_inverse]
+        self.arm = max([self.arm, 1e-3 * self.reach, *turning])
         self.radius = self.reach  # of the neighbourhood of an optimum
-        self.small = _SMALL * min(term.field.pitch_m for term in self.terms)
-        peak = sum(
+        self.peak = sum(
             float(term.weights.sum()) * float(np.abs(term.field.coefficients).max())
             for term in self.terms
         )
-        self.margin = peak * (
-            1e-11 * max(1.0, math.sqrt(len(stacked)) / 30.0) + 2.0 * float(rounding.max() - _CELL)
-        )
+        rounding = float(self.frames[:, 3].max()) - _CELL
+        scatter = 1e-11 * max(1.0, math.sqrt(len(weights)) / 30.0)
+        self.margin = self.peak * (scatter + 2.0 * rounding)
+
+    @property
+    def sum(self) -> kernels.Sum:
+        """The terms for the kernels."""
+        return kernels.Sum(
+            self.points, self.rows, self.frames, self.coefficients, self.window, self.arm,
+            self.reach,
+        )  # fmt: skip
+
+    @functools.cached_property
+    def bounds(self) -> kernels.Bounds:
+        """Bound tables of all fields, made when a search first asks for them."""
+        windows, curvatures = zip(*(term.field.tables for term in self.terms), strict=True)
+        small = _SMALL * self.pitch_m
+        return kernels.Bounds(_joined(windows), _joined(curvatures), self.margin, small)
+
+    def _stacked(self) -> FloatArray:
+        """All points (4, K): x, y, weight, and the most that all points after it can bring."""
+        stacked = []
+        for term in self.terms:
+            center = self.target_center if term.is_inverse else self.source_center
+            most = term.weights * term.field.maximum
+            rows = np.column_stack([term.points - center, term.weights, most])
+            stacked.append(rows[_shuffled(term)])
+        points = np.concatenate(stacked).T.copy()
+        after = np.cumsum(points[3, ::-1])[::-1] - points[3]
+        points[3] = np.maximum(after, 0.0)
+        return points
+
+    def _frames(self, radius_m: float) -> FloatArray:
+        """Origin, pitch, rounding of a place in cells, and highest value of each field (T, 5)."""
+        reach_m = radius_m + float(np.abs(self.window[1:3]).max() + self.window[4:].max())
+        frames = []
+        for term in self.terms:
+            x, y = term.field.origin - (
+                self.source_center if term.is_inverse else self.target_center
+            )
+            pitch_m = term.field.pitch_m
+            rounding = _CELL + 2.0**-48 * (reach_m + abs(x) + abs(y)) / pitch_m
+            frames.append([x, y, pitch_m, rounding, term.field.maximum])
+        return np.array(frames)
+
+    def _rows(self) -> NDArray[np.int64]:
+        """Where the parts of each term are in the flat arrays (T, 7); see `kernels.Sum`."""
+        rows, num_points, num_cells = [], 0, 0
+        for term in self.terms:
+            ends = num_points, num_points + len(term.points)
+            shape = term.field.coefficients.shape
+            rows.append([*ends, term.is_inverse, num_cells, *shape, NUM_WINDOWS * num_cells])
+            num_points, num_cells = ends[1], num_cells + math.prod(shape)
+        return np.array(rows, dtype=np.int64)
 
     def _turning_radius(self, term: Term) -> float:
         """Mean distance of a source field's content from the centre it turns about [m]."""
@@ -123,21 +156,6 @@ class Problem:
             place = field.origin[1 - axis] + field.pitch_m * np.arange(len(along))
             square += float((along * (place - self.source_center[1 - axis]) ** 2).sum())
         return math.sqrt(square / max(float(size.sum()), 1e-300))
-
-    def _rests(self, weights: FloatArray) -> FloatArray:
-        """For every point, the most that all points after it can bring (K,)."""
-        peaks = np.repeat(
-            [term.field.maximum for term in self.terms], [len(term.points) for term in self.terms]
-        )
-        after = np.cumsum((weights * peaks)[::-1])[::-1] - weights * peaks
-        return np.maximum(after, 0.0)
-
-    def _rounding(self, frames: list[list[float]], radius_m: float) -> FloatArray:
-        """How far [cells] a computed place may be off in each field (T,)."""
-        reach_m = radius_m + float(np.abs(self.window[1:3]).max() + self.window[4:].max())
-        return np.array(
-            [_CELL + 2.0**-48 * (reach_m + abs(x) + abs(y)) / pitch_m for x, y, pitch_m in frames]
-        )
 
     def _center(self, is_target: bool) -> FloatArray:
         """Weighted mean of the points in that frame, or the middle of the fields there."""
@@ -152,25 +170,16 @@ class Problem:
                 )
                 return mean
             return stacked.mean(axis=0)
-        low, high = self._extent(
-            [term.field for term in self.terms if term.is_inverse != is_target]
-        )
-        return 0.5 * (low + high)
-
-    @staticmethod
-    def _extent(fields: Sequence[Field]) -> tuple[FloatArray, FloatArray]:
-        lows = [field.origin for field in fields]
-        highs = [
-            field.origin + field.pitch_m * (np.array(field.coefficients.shape)[::-1] - 1)
-            for field in fields
-        ]
-        return np.array(lows).min(axis=0), np.array(highs).max(axis=0)
+        fields = [term.field for term in self.terms if term.is_inverse != is_target]
+        low = np.min([field.origin for field in fields], axis=0)
+        high = np.max([field.high for field in fields], axis=0)
+        return np.asarray(0.5 * (low + high))
 
     def _window(self) -> FloatArray:
         """All (theta, x, y) at which a point can touch its field: centre, half widths (6,)."""
         lows, highs = [], []
         for term in self.terms:
-            low, high = self._extent([term.field])
+            low, high = term.field.origin, term.field.high
             if term.is_inverse:
                 corners = np.maximum(
                     np.abs(low - self.source_center), np.abs(high - self.source_center)
@@ -201,33 +210,16 @@ class Problem:
     def value_at(self, parameters: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Objective, gradient (3,), second derivatives (3, 3) in (theta, x, y), all centred."""
         gradient, hessian = np.zeros(3), np.zeros((3, 3))
-        value = kernels.evaluate(
-            self.points,
-            self.rows,
-            self.frames,
-            self.coefficients,
-            np.asarray(parameters, dtype=np.float64),
-            gradient,
-            hessian,
-        )
-        return float(value), gradient, hessian
+        pose = np.asarray(parameters, dtype=np.float64)
+        return float(kernels.evaluate(self.sum, pose, gradient, hessian)), gradient, hessian
 
-    def ascend(self, parameters: FloatArray, max_steps: int = 50) -> tuple[float, FloatArray]:
-        """Climb to the local optimum above (theta, x, y)."""
+    def ascend(
+        self, parameters: FloatArray, max_steps: int = 50, longest_m: float | None = None
+    ) -> tuple[float, FloatArray]:
+        """Climb to the local optimum above (theta, x, y), in steps no longer than that."""
         pose = np.array(parameters, dtype=np.float64)
-        value = kernels.ascend(
-            self.points,
-            self.rows,
-            self.frames,
-            self.coefficients,
-            self.window,
-            self.arm,
-            self.reach,
-            pose,
-            max_steps,
-            1e-10,
-            np.empty((10, 3)),
-        )
+        longest_m = self.reach if longest_m is None else longest_m
+        value = kernels.ascend(self.sum, longest_m, pose, max_steps, 1e-10, np.empty((10, 3)))
         return float(value), pose
 
 
@@ -236,20 +228,10 @@ def _shuffled(term: Term) -> NDArray[np.int64]:
     return np.random.default_rng(0).permutation(len(term.points))
 
 
-def _joined(arrays: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+def _joined(arrays: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """One flat array; a single one is not copied."""
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
-
-
-def _level_table(size: int) -> NDArray[np.int8]:
-    """For every span: smallest pyramid level whose windows hold span + 1 cells from anywhere."""
-    table = np.empty(size + 1, dtype=np.int8)
-    level = 0
-    for span in range(size + 1):
-        while (1 << level) - (1 << max(0, level - 2)) < span:
-            level += 1
-        table[span] = level
-    return table
+    flat = [array.ravel() for array in arrays]
+    return flat[0] if len(flat) == 1 else np.concatenate(flat)
 
 
 def as_points(points: ArrayLike, name: str) -> FloatArray:

@@ -1,16 +1,19 @@
-# mypy: allow-untyped-defs
-"""Compiled sweeps: bounds of all translations of one slab of rotations, by adding up tables.
+"""Compiled sweeps: bounds of whole tiles of translations under a slab of rotations, by adding up.
 
-A slab is an interval of rotations. Under it a point reaches a rectangle of its field, and moving
-the whole slab by one cell of the translations moves that rectangle by as much. So a table of the
-field's largest value over rectangles of one size, read from the point's place on, *is* the point's
-part of the bounds of all translations, and bounding them is adding up rows of memory.
+A slab is an interval of rotations; a tile is `SIDE` x `SIDE` cells, squares of translations, of
+one slab. Tables of range maxima have square cells of their own, ``step`` to a cell of the
+translations; in them places are counted.
 
-Places are counted in *bases* of ``base`` cells of the field each; a cell of the translations is
-two bases wide. ``tables`` (N, N, 2, 2, rows, columns) go by the size of the rectangle along y and
-x, from `SMALLEST` bases on, by the parity of its first base, and then by every second base.
-``points`` (4, K) and ``frame`` (origin x, y, pitch, rounding) are the
-search's. ``nodes`` (M, 5): slab, first row, end row, first column, end column of translations.
+Under a slab the point of a forward term reaches a rectangle of its field, and the next cell of the
+translations moves that by ``step``. So every step-th number of a table of maxima over squares that
+large, from the point's place on, is its part of the bounds of all cells. The field of an inverse
+term is turned against the translations; so every slab gets a table of its own, over the lattice of
+u = y - t, and that is read backwards, since u falls as t rises.
+
+For reading, tables are cut into *strips*: (..., step, step, C, R, SIDE) by the phases of row and
+column, then by column; the ``SIDE`` numbers from that column on lie side by side, rows below each
+other, so that a tile's numbers are one run of memory. Strips begin ``SIDE`` cells before the first
+number that counts and end as far behind the last: a tile that reaches beyond adds zero.
 """
 
 from __future__ import annotations
@@ -19,222 +22,527 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-__all__ = ["SMALLEST", "add_slabs", "fill_boxes", "fill_tables", "highest", "split_nodes"]
+__all__ = [
+    "SIDE",
+    "add_forward",
+    "add_inverse",
+    "close_tiles",
+    "coarsen",
+    "cut_strips",
+    "find_greatest",
+    "slide_back",
+    "split_tiles",
+    "widen",
+]
 
-SMALLEST = 3  # bases that two bases can touch, at least
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
+IntArray = NDArray[np.int64]
+SumArray = NDArray[np.float32]
+TableArray = NDArray[np.int16]
+
+SIDE = 8
+"""Cells along a tile."""
 
 
 @njit(cache=True, nogil=True)
-def _fill_lattice(window, base, pad, lattice):
-    """Largest value of ``window`` (R, C), of cells, in every base, after `pad` bases of zeros."""
-    line = np.empty(window.shape[1], np.float32)
-    for row in range(0, window.shape[0], base):
-        line[:] = window[row]
-        for k in range(row + 1, min(row + base, window.shape[0])):
-            other = window[k]
-            for col in range(line.shape[0]):
-                line[col] = max(line[col], other[col])
-        into = lattice[pad + row // base, pad:]
-        for at in range((line.shape[0] - 1) // base + 1):
-            value = line[at * base]
-            for col in range(at * base + 1, min((at + 1) * base, line.shape[0])):
-                value = max(value, line[col])
-            into[at] = value
+def coarsen(windows: SumArray, size: float, unit: float, pad: int, table: TableArray) -> None:
+    """Greatest of ``windows`` (R, C), cells of a field, in cells of a table, in whole ``unit``s.
 
-
-@njit(cache=True, nogil=True)
-def fill_tables(window, base, pad, tables):
-    """Largest values of ``window`` (R, C), of cells, over rectangles of bases; zero outside.
-
-    ``pad`` bases of zeros come before the first, an even number, and at least one after the last.
+    A cell of the table is ``size`` of the field's wide. ``pad`` rows and columns of zeros come
+    before the first.
     """
-    num, rows, cols = tables.shape[0], 2 * tables.shape[4], tables.shape[5]
-    lattice = np.zeros((rows, 2 * cols), np.float32)
-    _fill_lattice(window, base, pad, lattice)
-    # Even and odd columns apart, and zeros behind them for what is looked up beyond the last.
-    room = cols + num + SMALLEST
-    tall = np.zeros((rows, 2, room), np.float32)
+    num_rows, num_cols = windows.shape
+    rows, cols = table.shape[0] - pad, table.shape[1] - pad
+    table[:] = 0
+    line = np.empty(num_cols, np.float32)
+    scale = 1.0 / unit
     for row in range(rows):
-        even, odd, line = tall[row, 0], tall[row, 1], lattice[row]
+        first, last = math.floor(row * size), min(math.ceil((row + 1) * size), num_rows)
+        line[:] = windows[first]
+        for k in range(first + 1, last):
+            other = windows[k]
+            for col in range(num_cols):
+                line[col] = max(line[col], other[col])
         for col in range(cols):
-            even[col], odd[col] = line[2 * col], line[2 * col + 1]
-    single = tall.copy()
-    for ky in range(num):
-        # The last row is zero, so what is cut off beyond it changes nothing.
-        for k in range(SMALLEST + ky - 1 if ky else 1, SMALLEST + ky):
-            for row in range(rows - k):
-                for parity in range(2):
-                    line, other = tall[row, parity], single[row + k, parity]
-                    for col in range(room):
-                        line[col] = max(line[col], other[col])
-        for row in range(rows):
-            for parity in range(2):
-                first = tall[row, parity]
-                second, third = tall[row, 1 - parity, parity:], tall[row, parity, 1:]
-                into = tables[ky, 0, row & 1, parity, row >> 1]
-                for col in range(cols):
-                    into[col] = max(first[col], max(second[col], third[col]))
-                for kx in range(1, num):
-                    # The base that the rectangle of this size has more than the last one.
-                    ahead = SMALLEST + kx - 1 + parity
-                    more, below = tall[row, ahead & 1, ahead >> 1 :], into
-                    into = tables[ky, kx, row & 1, parity, row >> 1]
-                    for col in range(cols):
-                        into[col] = max(below[col], more[col])
+            begin, end = math.floor(col * size), min(math.ceil((col + 1) * size), num_cols)
+            value = line[begin]
+            for k in range(begin + 1, end):
+                value = max(value, line[k])
+            table[pad + row, pad + col] = math.ceil(value * scale)
 
 
 @njit(cache=True, nogil=True)
-def _find_places(points, frame, base, pad, theta, delta, origin, num, places, weights):
-    """Where each point's table starts for the cell around ``origin``.
+def widen(table: TableArray, more_rows: int, more_cols: int, wide: TableArray) -> None:
+    """Greatest of each number and of so many rows and columns behind it, as far as there are."""
+    num_rows, num_cols = table.shape
+    lines = table.copy()
+    for row in range(num_rows):
+        line = lines[row]
+        for ahead in range(1, min(more_cols + 1, num_cols)):
+            other = table[row, ahead:]
+            for col in range(num_cols - ahead):
+                line[col] = max(line[col], other[col])
+    for row in range(num_rows):
+        line = wide[row]
+        line[:] = lines[row]
+        for k in range(row + 1, min(row + more_rows + 1, num_rows)):
+            other = lines[k]
+            for col in range(num_cols):
+                line[col] = max(line[col], other[col])
 
-    ``places`` (K, 4): size along y times `num` plus that along x, parities, row, column. Points
-    whose rectangles are larger than the tables go are left out. Returns the sum of their weights
-    and the number of the others.
+
+@njit(cache=True, nogil=True)
+def cut_strips(table: TableArray, first: int, step: int, strips: TableArray) -> None:
+    """Strips (step, step, C, R, SIDE) of one table, whose rows and columns count from ``first``.
+
+    What lies outside of the table is zero.
     """
+    num_rows, num_cols = table.shape
+    cols, rows = strips.shape[2], strips.shape[3]
+    plane = np.empty((rows, cols + SIDE), np.int16)
+    for phase_row in range(step):
+        for phase_col in range(step):
+            begin = first + phase_col
+            low = max(0, -(begin // step))  # the first that is not negative
+            high = min(cols + SIDE, (num_cols - 1 - begin) // step + 1)
+            for k in range(rows):
+                row = first + phase_row + k * step
+                line = plane[k]
+                line[:] = 0
+                if 0 <= row < num_rows:
+                    for j in range(low, high):
+                        line[j] = table[row, begin + j * step]
+            for j in range(cols):
+                into = strips[phase_row, phase_col, j]
+                for k in range(rows):
+                    for x in range(SIDE):
+                        into[k, x] = plane[k, j + x]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _collect(
+    places: IntArray, factors: SumArray, count: int, tile_row: int, tile_col: int,
+    step: int, cols: int, rows: int, starts: IntArray, weights: SumArray,
+) -> int:  # fmt: skip
+    """Where the numbers of a tile start, for the points that do not add zero; their number."""
+    num = 0
+    for k in range(count):
+        col, row = places[k, 3] + SIDE * tile_col, places[k, 4] + SIDE * tile_row
+        if 0 <= col < cols and 0 <= row <= rows - SIDE:
+            phase = (places[k, 0] * step + places[k, 1]) * step + places[k, 2]
+            starts[num] = ((phase * cols + col) * rows + row) * SIDE
+            weights[num] = factors[k]
+            num += 1
+    return num
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add(
+    flat: TableArray, starts: IntArray, weights: SumArray, count: int, total: SumArray
+) -> None:
+    """Add the numbers of a tile, four points at a time."""
+    size = SIDE * SIDE
+    for k in range(0, count - 3, 4):
+        w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
+        a, b = flat[starts[k] : starts[k] + size], flat[starts[k + 1] : starts[k + 1] + size]
+        c, d = (
+            flat[starts[k + 2] : starts[k + 2] + size],
+            flat[starts[k + 3] : starts[k + 3] + size],
+        )
+        for x in range(SIDE * SIDE):
+            total[x] += (w0 * np.float32(a[x]) + w1 * np.float32(b[x])) + (
+                w2 * np.float32(c[x]) + w3 * np.float32(d[x])
+            )
+    for k in range(count - count % 4, count):
+        w, a = weights[k], flat[starts[k] : starts[k] + size]
+        for x in range(SIDE * SIDE):
+            total[x] += w * np.float32(a[x])
+
+
+@njit(cache=True, nogil=True)
+def _forward_places(
+    theta: float, delta: float, half: float, origin: FloatArray, points: FloatArray,
+    first_point: int, frame: FloatArray, size: float, layer_of_width: IntArray,
+    slot_of_layer: IntArray, first: int, step: int, unit: float, places: IntArray,
+    factors: SumArray,
+) -> tuple[int, float]:  # fmt: skip
+    """Slot, phases, column and row of each point's numbers for the first cell.
+
+    Points whose rectangles are wider than the tables are left out. Returns the number of the
+    others, and the sum of the weights that are left out.
+    """
+    scale = 1.0 / (frame[2] * size)
     swing = math.sin(delta) if delta < 0.5 * math.pi else 1.0
     bow = 0.5 * (1.0 - math.cos(min(delta, math.pi)))
-    scale, reach = 1.0 / (frame[2] * base), 1.0 + frame[3] / base
-    shift_x = (origin[0] - frame[0]) * scale + 0.5 / base
-    shift_y = (origin[1] - frame[1]) * scale + 0.5 / base
-    c, s = math.cos(theta) * scale, math.sin(theta) * scale
+    shift_x = (origin[0] - frame[0]) * scale + 0.5 / size
+    shift_y = (origin[1] - frame[1]) * scale + 0.5 / size
+    cos, sin, reach = math.cos(theta) * scale, math.sin(theta) * scale, half * scale + frame[3]
     left_out, count = 0.0, 0
-    for k in range(points.shape[1]):
-        rx, ry = c * points[0, k] - s * points[1, k], s * points[0, k] + c * points[1, k]
-        u, v = (1.0 - bow) * rx + shift_x, (1.0 - bow) * ry + shift_y
+    for k in range(places.shape[0]):
+        at = first_point + k
+        x, y, weight = points[0, at], points[1, at], points[2, at]
+        rx, ry = cos * x - sin * y, sin * x + cos * y
         half_x = reach + swing * abs(ry) + bow * abs(rx)
         half_y = reach + swing * abs(rx) + bow * abs(ry)
-        i, j = math.floor(u - half_x), math.floor(v - half_y)
-        nx = math.floor(u + half_x) - i + 1 - SMALLEST
-        ny = math.floor(v + half_y) - j + 1 - SMALLEST
-        if nx >= num or ny >= num:
-            left_out += points[2, k]
+        u, v = (1.0 - bow) * rx + shift_x, (1.0 - bow) * ry + shift_y
+        col, row = math.floor(u - half_x), math.floor(v - half_y)
+        width, height = math.floor(u + half_x) - col + 1, math.floor(v + half_y) - row + 1
+        slot = -1
+        if max(width, height) < layer_of_width.shape[0]:
+            slot = slot_of_layer[layer_of_width[height], layer_of_width[width]]
+        if slot < 0:
+            left_out += weight
             continue
-        i, j = i + pad, j + pad
-        places[count, 0] = ny * num + nx
-        places[count, 1] = 2 * (j & 1) + (i & 1)
-        places[count, 2], places[count, 3] = j >> 1, i >> 1
-        weights[count] = points[2, k]
+        col, row = col - first, row - first
+        places[count, 0], places[count, 1], places[count, 2] = slot, row % step, col % step
+        places[count, 3], places[count, 4] = col // step, row // step
+        factors[count] = weight * unit
         count += 1
-    return left_out, count
+    return count, left_out
 
 
 @njit(cache=True, nogil=True)
-def add_slabs(
-    points, frame, tables, base, pad, maximum, slack, first_theta, delta, origin, nodes, offsets,
-    sums,
-):  # fmt: skip
-    """Bounds of all cells of some nodes into ``sums``, flat, each node's from its offset on.
+def add_forward(
+    tiles: IntArray, first_theta: float, delta: float, half: float, origin: FloatArray,
+    points: FloatArray, begin: int, end: int, frame: FloatArray, size: float, step: int,
+    unit: float, layer_of_width: IntArray, slot_of_layer: IntArray, maximum: float, first: int,
+    strips: TableArray, sums: SumArray,
+) -> None:  # fmt: skip
+    """Add what a forward term can bring at most to the cells of tiles (K, 3) [slab, row, column].
 
-    A slab's rotation is ``first_theta + 2 slab delta``, a cell's translation ``origin`` plus
-    column and row times its width. ``maximum`` bounds the field; ``slack`` is added to all bounds,
-    for what float32 may round away.
+    A slab's rotations are ``delta`` around ``first_theta + 2 slab delta``, a cell's translations
+    ``half`` around ``origin`` plus column and row times its width. ``points[:, begin:end]`` and
+    ``frame`` are the search's. ``strips`` (S, step, step, C, R, SIDE) are found in
+    ``slot_of_layer`` by the layers of a rectangle's height and width; they count in ``unit`` and
+    from the table's row and column ``first``. A table's cell is ``size`` of the field's wide.
+    ``maximum`` bounds the field.
     """
-    num, rows, cols = tables.shape[0], tables.shape[4], tables.shape[5]
-    flat, size = tables.ravel(), rows * cols
-    places = np.empty((points.shape[1], 4), np.int64)
-    weights = np.empty(points.shape[1], np.float32)
-    starts = np.empty(4, np.int64)
-    slab, left_out, count = -1, 0.0, 0
-    for n in range(nodes.shape[0]):
-        if nodes[n, 0] != slab:
-            slab = nodes[n, 0]
-            theta = first_theta + 2.0 * slab * delta
-            left_out, count = _find_places(
-                points, frame, base, pad, theta, delta, origin, num, places, weights
-            )
-        j0, i0 = nodes[n, 1], nodes[n, 3]
-        height, width = nodes[n, 2] - j0, nodes[n, 4] - i0
-        total = sums[offsets[n] : offsets[n + 1]]
-        total[:] = np.float32(left_out * maximum + slack)
-        k = 0
-        while k < count:
-            # Four points at once where none of their tables ends inside the node.
-            is_inside = k + 4 <= count
-            if is_inside:
-                for q in range(4):
-                    row, col = places[k + q, 2] + j0, places[k + q, 3] + i0
-                    is_inside &= row >= 0 and col >= 0
-                    is_inside &= row + height <= rows and col + width <= cols
-                    table = 4 * places[k + q, 0] + places[k + q, 1]
-                    starts[q] = table * size + row * cols + col
-            if is_inside:
-                w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
-                for y in range(height):
-                    line = total[y * width : (y + 1) * width]
-                    at = y * cols
-                    a = flat[starts[0] + at : starts[0] + at + width]
-                    b = flat[starts[1] + at : starts[1] + at + width]
-                    c = flat[starts[2] + at : starts[2] + at + width]
-                    d = flat[starts[3] + at : starts[3] + at + width]
-                    for x in range(width):
-                        line[x] += (w0 * a[x] + w1 * b[x]) + (w2 * c[x] + w3 * d[x])
-                k += 4
-                continue
-            row, col = places[k, 2] + j0, places[k, 3] + i0
-            first_y, end_y = max(0, -row), min(height, rows - row)
-            first_x, end_x = max(0, -col), min(width, cols - col)
-            if first_x < end_x:
-                w, table = weights[k], 4 * places[k, 0] + places[k, 1]
-                start = table * size + row * cols + col + first_x
-                for y in range(first_y, end_y):
-                    line = total[y * width + first_x : y * width + end_x]
-                    a = flat[start + y * cols : start + y * cols + end_x - first_x]
-                    for x in range(end_x - first_x):
-                        line[x] += w * a[x]
+    num = end - begin
+    places, factors = np.empty((num, 5), np.int64), np.empty(num, np.float32)
+    starts, weights = np.empty(num, np.int64), np.empty(num, np.float32)
+    flat, cols, rows = strips.ravel(), strips.shape[3], strips.shape[4]
+    slab, count, left_out = -1, 0, 0.0
+    for k in range(tiles.shape[0]):
+        if tiles[k, 0] != slab:
+            slab = tiles[k, 0]
+            count, left_out = _forward_places(
+                first_theta + 2.0 * slab * delta, delta, half, origin, points, begin, frame, size,
+                layer_of_width, slot_of_layer, first, step, unit, places, factors,
+            )  # fmt: skip
+        total = sums[k]
+        total += np.float32(left_out * maximum)
+        num = _collect(
+            places, factors, count, tiles[k, 1], tiles[k, 2], step, cols, rows, starts, weights
+        )
+        _add(flat, starts, weights, num, total)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _clip(low: float, high: float, slope: float, begin: float, end: float) -> tuple[float, float]:
+    """The part of [begin, end] where ``slope * u`` is within [low, high]; ends may cross."""
+    if abs(slope) < 1e-9:
+        return (begin, end) if low <= 1e-6 * end and high >= 1e-6 * begin else (end, begin)
+    first, last = low / slope, high / slope
+    return max(begin, min(first, last)), min(end, max(first, last))
+
+
+@njit(cache=True, nogil=True)
+def _fill_wide(
+    begin: int, end: int, lefts: IndexArray, tops: IndexArray, widths: IndexArray, widest: int,
+    tables: TableArray, line: TableArray,
+) -> None:  # fmt: skip
+    """Greatest values over the squares of a row that are wider than the tables' windows."""
+    num_rows, num_cols = tables.shape[1], tables.shape[2]
+    for col in range(begin, end):
+        left, top, width = lefts[col], tops[col], widths[col]
+        if width > widest:
+            best = line[col]
+            for y in range(top, min(top + width, num_rows), widest):
+                for x in range(left, min(left + width, num_cols), widest):
+                    best = max(best, tables[-1, y, x])
+            line[col] = best
+
+
+@njit(cache=True, nogil=True)
+def turned_maxima(
+    theta: float, delta: float, frame: IntArray, fold: float, tables: TableArray,
+    content: FloatArray, shift: FloatArray, layer_of_width: IntArray, slack: float,
+    single: TableArray,
+) -> None:  # fmt: skip
+    """Bounds of a field over squares of u, turned back by all rotations of a slab.
+
+    ``single`` (n, m) gets those of squares of u, ``fold`` cells of the tables wide, from the row
+    and column in ``frame`` on. ``shift`` (2,) is the place of the turned point 0 in the tables;
+    the field is zero outside of ``content`` [low x, low y, high x, high y].
+    """
+    num_rows, num_cols = tables.shape[1], tables.shape[2]
+    rows, cols = single.shape
+    cos, sin = math.cos(theta), math.sin(theta)
+    swing = math.sin(delta) if delta < 0.5 * math.pi else 1.0
+    bow = 0.5 * (1.0 - math.cos(min(delta, math.pi)))
+    corner = math.sqrt(2.0)
+    half = 0.5 * fold * min(corner, abs(cos) + abs(sin) + corner * delta) + slack
+    end_x, end_y = num_cols - 1.0, num_rows - 1.0
+    lefts, tops = np.empty(cols, np.int32), np.empty(cols, np.int32)
+    widths = np.empty(cols, np.int32)
+    flat, stride = tables.ravel(), np.int32(num_cols)
+    layers = (layer_of_width * (num_rows * num_cols)).astype(np.int32)
+    widest = np.int32(layers.shape[0] - 1)
+    first_row, first_col = frame[0], frame[1]
+    first_u, last_u = fold * first_col, fold * (first_col + cols)
+    far_u, stay = max(abs(first_u), abs(last_u)), 1.0 - bow
+    x0, y0 = shift[0], shift[1]
+    for row in range(rows):
+        uy = fold * (first_row + row + 0.5)
+        line = single[row]
+        line[:] = 0
+        # A square can meet the field where its middle, less what it reaches, is inside.
+        reach = half + (abs(uy) + far_u) * (swing + 2.0 * bow)
+        low, high = _clip(
+            content[0] - reach - x0 - sin * uy, content[2] + reach - x0 - sin * uy, cos,
+            first_u, last_u,
+        )  # fmt: skip
+        low, high = _clip(
+            content[1] - reach - y0 - cos * uy, content[3] + reach - y0 - cos * uy, -sin, low, high
+        )
+        begin = max(0, math.floor(low / fold) - first_col - 1)
+        end = min(cols, math.ceil(high / fold) - first_col + 1)
+        most = np.int32(0)
+        for col in range(begin, end):
+            ux = first_u + fold * (col + 0.5)
+            qx, qy = cos * ux + sin * uy, cos * uy - sin * ux
+            half_x = half + abs(qy) * swing + abs(qx) * bow
+            half_y = half + abs(qx) * swing + abs(qy) * bow
+            # Outside of the tables everything is zero; truncation is the floor of the rest.
+            x, y = stay * qx + x0, stay * qy + y0
+            left = np.int32(min(max(x - half_x, 0.0), end_x))
+            top = np.int32(min(max(y - half_y, 0.0), end_y))
+            right = np.int32(min(max(x + half_x, 0.0), end_x))
+            bottom = np.int32(min(max(y + half_y, 0.0), end_y))
+            width = np.int32(max(right - left, bottom - top) + np.int32(1))
+            lefts[col], tops[col], widths[col] = left, top, width
+            most = max(most, width)
+        for col in range(begin, end):
+            at = layers[np.uint32(min(widths[col], widest))] + tops[col] * stride + lefts[col]
+            line[col] = flat[np.uint32(at)]
+        if most > widest:
+            _fill_wide(begin, end, lefts, tops, widths, widest, tables, line)
+
+
+@njit(cache=True, nogil=True)
+def slide_back(single: TableArray, step: int, result: TableArray) -> None:
+    """Greatest values over windows of ``step + 1`` numbers each way, the last window first.
+
+    ``result`` (n + step, m + step) holds all windows that meet ``single`` (n, m); what is outside
+    counts as zero. A growing translation meets them in this order.
+    """
+    rows, cols = single.shape
+    wide = np.empty((rows, cols + step), np.int16)
+    padded = np.zeros(cols + 2 * step, np.int16)
+    for row in range(rows):
+        padded[step : step + cols] = single[row]
+        line = wide[row]
+        line[:] = padded[: cols + step]
+        for ahead in range(1, step + 1):
+            other = padded[ahead : ahead + cols + step]
+            for col in range(cols + step):
+                line[col] = max(line[col], other[col])
+    best = np.empty(cols + step, np.int16)
+    for k in range(rows + step):
+        low = rows - 1 - k
+        begin, end = max(low, 0), min(low + step, rows - 1)
+        best[:] = wide[begin]
+        for row in range(begin + 1, end + 1):
+            other = wide[row]
+            for col in range(cols + step):
+                best[col] = max(best[col], other[col])
+        if low < 0 or low + step >= rows:
+            for col in range(cols + step):
+                best[col] = max(best[col], 0)
+        into = result[k]
+        for col in range(cols + step):
+            into[col] = best[cols + step - 1 - col]
+
+
+@njit(cache=True, nogil=True)
+def _fill_frame(
+    theta: float, delta: float, content: FloatArray, shift: FloatArray, low: FloatArray,
+    high: FloatArray, fold: float, frame: IntArray,
+) -> None:  # fmt: skip
+    """First row and column, and numbers of both, of the squares of u that a slab needs.
+
+    Those are where the field is not zero, as far as they are in [``low``, ``high``] (2,), which
+    count cells of the tables.
+    """
+    cos, sin = math.cos(theta), math.sin(theta)
+    far = 0.0
+    min_x, max_x, min_y, max_y = np.inf, -np.inf, np.inf, -np.inf
+    for k in range(4):
+        qx, qy = content[2 * (k & 1)] - shift[0], content[2 * (k >> 1) + 1] - shift[1]
+        ux, uy = cos * qx - sin * qy, sin * qx + cos * qy
+        far = max(far, math.sqrt(qx * qx + qy * qy))
+        min_x, max_x = min(min_x, ux), max(max_x, ux)
+        min_y, max_y = min(min_y, uy), max(max_y, uy)
+    reach = far * min(delta, 2.0)  # no farther does a turn take it
+    begin_x = math.floor(max(min_x - reach, low[0]) / fold) - 1
+    begin_y = math.floor(max(min_y - reach, low[1]) / fold) - 1
+    frame[0], frame[1] = begin_y, begin_x
+    frame[2] = max(1, math.ceil(min(max_y + reach, high[1]) / fold) + 1 - begin_y)
+    frame[3] = max(1, math.ceil(min(max_x + reach, high[0]) / fold) + 1 - begin_x)
+
+
+@njit(cache=True, nogil=True)
+def _inverse_places(
+    half: float, origin: FloatArray, points: FloatArray, first_point: int, scale: float,
+    frame: IntArray, step: int, places: IntArray,
+) -> None:  # fmt: skip
+    """The same as `_forward_places` for the strips of `slide_back`, squares of u to a metre."""
+    for k in range(places.shape[0]):
+        for axis in range(2):
+            low = math.floor(scale * (points[axis, first_point + k] - origin[axis] - half))
+            window = frame[1 - axis] + frame[3 - axis] - 1 - low
+            # Strips begin a tile before the first window.
+            places[k, 2 - axis] = window % step
+            places[k, 3 + axis] = window // step + SIDE
+        places[k, 0] = 0
+
+
+@njit(cache=True, nogil=True)
+def _find_needed(
+    tiles: IntArray, begin: int, origin: FloatArray, half: float, points: FloatArray, first: int,
+    end: int, low: FloatArray, high: FloatArray,
+) -> None:  # fmt: skip
+    """Least and greatest u = y - t (2,) of an inverse term's points and the tiles of one slab."""
+    low[:], high[:] = np.inf, -np.inf
+    for k in range(first, end):
+        for axis in range(2):
+            low[axis] = min(low[axis], points[axis, k])
+            high[axis] = max(high[axis], points[axis, k])
+    for axis in range(2):
+        least, most, k = tiles[begin, 2 - axis], tiles[begin, 2 - axis], begin
+        while k < tiles.shape[0] and tiles[k, 0] == tiles[begin, 0]:
+            least, most = min(least, tiles[k, 2 - axis]), max(most, tiles[k, 2 - axis])
             k += 1
+        low[axis] -= origin[axis] + half * (2 * SIDE * (most + 1) - 1)
+        high[axis] -= origin[axis] + half * (2 * SIDE * least - 1)
 
 
 @njit(cache=True, nogil=True)
-def highest(sums, cells):
-    """Indices of the highest sums into ``cells`` (K,), highest first."""
-    count = 0
-    for at in range(sums.shape[0]):
-        if count == cells.shape[0] and sums[at] <= sums[cells[count - 1]]:
-            continue
-        k = min(count, cells.shape[0] - 1)
-        while k > 0 and sums[at] > sums[cells[k - 1]]:
-            cells[k] = cells[k - 1]
-            k -= 1
-        cells[k] = at
-        count = min(count + 1, cells.shape[0])
+def add_inverse(
+    tiles: IntArray, first_theta: float, delta: float, half: float, origin: FloatArray,
+    points: FloatArray, begin: int, end: int, frame: FloatArray, size: float, step: int,
+    unit: float, layer_of_width: IntArray, fold: int, content: FloatArray, tables: TableArray,
+    sums: SumArray,
+) -> None:  # fmt: skip
+    """The same as `add_forward` for an inverse term.
 
-
-@njit(cache=True, nogil=True)
-def fill_boxes(cells, nodes, offsets, first_theta, delta, origin, half_m, boxes):
-    """Boxes (K, 6) of cells (K,), which are given by their index in all sums."""
-    for k in range(cells.shape[0]):
-        n = np.searchsorted(offsets, cells[k], side="right") - 1
-        at, width = cells[k] - offsets[n], nodes[n, 4] - nodes[n, 3]
-        boxes[k, 0] = first_theta + 2.0 * nodes[n, 0] * delta
-        boxes[k, 1] = origin[0] + 2.0 * half_m * (nodes[n, 3] + at % width)
-        boxes[k, 2] = origin[1] + 2.0 * half_m * (nodes[n, 1] + at // width)
-        boxes[k, 3] = delta
-        boxes[k, 4], boxes[k, 5] = half_m, half_m
-
-
-@njit(cache=True, nogil=True)
-def split_nodes(nodes, offsets, sums, floor, num_turns, children):
-    """Nodes of the next level around the cells above `floor`; their number.
-
-    ``children`` (num_turns M, 5). Each child holds one of `num_turns` parts of the slab, and the
-    rectangle around those cells, each of them cut in four.
+    ``tables`` (L, R, C) are its field's, by layers. The lattice of u has one square for ``fold``
+    of their cells.
     """
-    count = 0
-    for n in range(nodes.shape[0]):
-        j0, i0, width = nodes[n, 1], nodes[n, 3], nodes[n, 4] - nodes[n, 3]
-        low_x, high_x, low_y, high_y = width, -1, nodes[n, 2] - j0, -1
-        for y in range(nodes[n, 2] - j0):
-            line = sums[offsets[n] + y * width : offsets[n] + (y + 1) * width]
-            for x in range(width):
-                if line[x] > floor:
-                    low_x, high_x = min(low_x, x), max(high_x, x)
-                    low_y, high_y = min(low_y, y), y
-        if high_x < 0:
-            continue
-        for turn in range(num_turns):
-            children[count, 0] = num_turns * nodes[n, 0] + turn
-            children[count, 1], children[count, 2] = 2 * (j0 + low_y), 2 * (j0 + high_y + 1)
-            children[count, 3], children[count, 4] = 2 * (i0 + low_x), 2 * (i0 + high_x + 1)
-            count += 1
+    num, cell = end - begin, frame[2] * size
+    places, factors = np.empty((num, 5), np.int64), np.empty(num, np.float32)
+    starts, weights = np.empty(num, np.int64), np.empty(num, np.float32)
+    for k in range(num):
+        factors[k] = points[2, begin + k] * unit
+    shift = np.empty(2)
+    shift[0], shift[1] = 0.5 / size - frame[0] / cell, 0.5 / size - frame[1] / cell
+    lattice, stride = np.empty(4, np.int64), step // fold
+    low, high = np.empty(2), np.empty(2)
+    flat, cols, rows, slab = np.empty(0, np.int16), 0, 0, -1
+    for k in range(tiles.shape[0]):
+        if tiles[k, 0] != slab:
+            slab = tiles[k, 0]
+            theta = first_theta + 2.0 * slab * delta
+            _find_needed(tiles, k, origin, half, points, begin, end, low, high)
+            _fill_frame(theta, delta, content, shift, low / cell, high / cell, fold, lattice)
+            single = np.empty((lattice[2], lattice[3]), np.int16)
+            turned_maxima(
+                theta, delta, lattice, fold, tables, content, shift, layer_of_width,
+                2.0 * frame[3], single,
+            )  # fmt: skip
+            turned = np.empty((lattice[2] + stride, lattice[3] + stride), np.int16)
+            slide_back(single, stride, turned)
+            rows = (lattice[2] - 1) // stride + 2 + 2 * SIDE
+            cols = (lattice[3] - 1) // stride + 2 + SIDE
+            num_strips = stride * stride * cols * rows * SIDE
+            if len(flat) < num_strips:
+                flat = np.empty(num_strips + num_strips // 2, np.int16)
+            strips = flat[:num_strips].reshape((stride, stride, cols, rows, SIDE))
+            cut_strips(turned, -SIDE * stride, stride, strips)
+            _inverse_places(
+                half, origin, points, begin, 1.0 / (cell * fold), lattice, stride, places
+            )
+        num = _collect(
+            places, factors, end - begin, tiles[k, 1], tiles[k, 2], stride, cols, rows, starts,
+            weights,
+        )  # fmt: skip
+        _add(flat, starts, weights, num, sums[k])
+
+
+@njit(cache=True, nogil=True)
+def close_tiles(
+    tiles: IntArray, parents: IntArray, parent_sums: SumArray, floor: float, rows: int, cols: int,
+    sums: SumArray,
+) -> None:  # fmt: skip
+    """Bounds of tiles are at most their parents', and -inf where nothing is to be looked for.
+
+    That is in cells outside of the window, and in those of which ``parent_sums``, at ``parents``
+    (K,), say that they are not above ``floor``.
+    """
+    for k in range(tiles.shape[0]):
+        row, col, total = tiles[k, 1], tiles[k, 2], sums[k]
+        parent = parent_sums[parents[k]]
+        first_row, first_col = SIDE // 2 * (row & 1), SIDE // 2 * (col & 1)
+        for y in range(SIDE):
+            for x in range(SIDE):
+                above = parent[SIDE * (first_row + y // 2) + first_col + x // 2]
+                at = SIDE * y + x
+                is_inside = SIDE * row + y < rows and SIDE * col + x < cols
+                total[at] = min(total[at], above) if is_inside and above > floor else -np.inf
+
+
+@njit(cache=True, nogil=True)
+def find_greatest(sums: SumArray, greatest: SumArray, cells: IntArray) -> None:
+    """Greatest sum of each tile (K,), and its cell (K,)."""
+    for k in range(sums.shape[0]):
+        best, at = sums[k, 0], 0
+        for x in range(1, SIDE * SIDE):
+            if sums[k, x] > best:
+                best, at = sums[k, x], x
+        greatest[k], cells[k] = best, at
+
+
+@njit(cache=True, nogil=True)
+def split_tiles(
+    tiles: IntArray, sums: SumArray, floor: float, turns: int, children: IntArray,
+    parents: IntArray,
+) -> int:  # fmt: skip
+    """Tiles of the next level, by slab, around the cells above ``floor``; their number.
+
+    ``children`` (4 turns K, 3) have half the cells, and one of ``turns`` parts of the slab;
+    ``parents`` (4 turns K,) are the indices of the tiles that they lie in.
+    """
+    count, begin, half = 0, 0, SIDE // 2
+    while begin < tiles.shape[0]:
+        end = begin
+        while end < tiles.shape[0] and tiles[end, 0] == tiles[begin, 0]:
+            end += 1
+        for turn in range(turns):
+            for k in range(begin, end):
+                for part in range(4):
+                    row, col = part >> 1, part & 1
+                    is_open = False
+                    for y in range(half * row, half * row + half):
+                        for x in range(half * col, half * col + half):
+                            is_open |= sums[k, SIDE * y + x] > floor
+                    if is_open:
+                        children[count, 0] = turns * tiles[k, 0] + turn
+                        children[count, 1] = 2 * tiles[k, 1] + row
+                        children[count, 2] = 2 * tiles[k, 2] + col
+                        parents[count] = k
+                        count += 1
+        begin = end
     return count
