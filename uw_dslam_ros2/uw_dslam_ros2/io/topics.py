@@ -1,0 +1,343 @@
+"""Which topic plays which role, and whose it is: found by type, or as the settings say.
+
+Pure functions on tables of topics (name -> type); nothing is opened here. A type says what a topic
+can be; names only decide between several topics that can be the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from dataclasses import fields as dataclass_fields
+
+from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.errors import ConfigError, DataError
+from uw_dslam_ros2.core.findings import WORDS
+
+__all__ = ["ROLES", "TopicsConfig", "VehicleTopics", "find_vehicles", "roles_of_type"]
+
+ROLES = ("sonar", "velocity", "imu", "depth", "odometry", "fix", "truth", "tf_static")
+"""What a topic can be to a mapper."""
+
+_SENSORS = ("sonar", "velocity", "imu", "depth", "odometry", "fix")
+_NAVIGATION = {"velocity", "imu", "odometry"}
+_REQUIRED = ("sonar", "velocity", "imu", "odometry")
+"""Roles of which the wrong topic spoils a map; of the others the best guess is taken."""
+
+_TYPES: dict[str, tuple[str, ...]] = {
+    "marine_acoustic_msgs/msg/ProjectedSonarImage": ("sonar",),
+    "sensor_msgs/msg/LaserScan": ("sonar",),
+    "sensor_msgs/msg/PointCloud2": ("sonar",),
+    "marine_acoustic_msgs/msg/Dvl": ("velocity",),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": ("velocity",),
+    "sensor_msgs/msg/Imu": ("imu",),
+    "sensor_msgs/msg/FluidPressure": ("depth",),
+    "nav_msgs/msg/Odometry": ("odometry",),
+    "tf2_msgs/msg/TFMessage": ("tf_static",),
+}
+
+# A type that says what it is goes before one that can hold anything.
+_GENERAL_TYPES = {
+    "sensor_msgs/msg/LaserScan": 1,
+    "sensor_msgs/msg/PointCloud2": 2,
+    "sensor_msgs/msg/PointCloud": 2,
+    "sensor_msgs/msg/Image": 3,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": 1,
+    "geometry_msgs/msg/TwistStamped": 2,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": 1,
+    "geometry_msgs/msg/PoseStamped": 2,
+    "nav_msgs/msg/Odometry": 1,
+}
+# Most of these topics come from something else: only a name makes one a sensor.
+_NEEDS_A_NAME = {"sensor_msgs/msg/Image", "std_msgs/msg/Float32", "std_msgs/msg/Float64"}
+_NAMES = {
+    "sonar": (
+        "sonar", "oculus", "gemini", "ping360", "blueview", "aris", "didson", "fls", "mbes",
+        "micron", "miniking", "ping", "scan", "points",
+    ),
+    "velocity": ("dvl", "velocity", "nucleus", "twist"),
+    "imu": ("imu", "ahrs"),
+    "depth": ("depth", "pressure"),
+    "odometry": ("odometry", "odom", "ekf", "filtered"),
+    "fix": ("fix", "usbl", "gps", "gnss", "navsat"),
+}  # fmt: skip
+_TRUTH = {"truth", "ground_truth", "groundtruth", "gt"}
+# Not measurements: what somebody wants, what has been made of a sensor, or a camera.
+_NO_MEASUREMENT = {
+    "cmd", "cmd_vel", "command", "desired", "setpoint", "goal", "reference", "target", "camera",
+    "rgb", "viewer", "visualization", "debug",
+}  # fmt: skip
+_SAME_ROLE = {"dvl": "velocity", "scan": "sonar", "points": "sonar", "pressure": "depth"}
+
+
+@dataclass(frozen=True, slots=True)
+class TopicsConfig(Config):
+    """Topics by role; an empty one is found by its type.
+
+    A name without a leading slash is below the vehicle's namespace.
+    """
+
+    sonar: str = setting("", doc="topic of the sonar; empty: found by its type")
+    velocity: str = setting("", doc="topic of the DVL or other velocity; empty: found by its type")
+    imu: str = setting("", doc="topic of the IMU or compass; empty: found by its type")
+    depth: str = setting("", doc="topic of the pressure or depth; empty: found by its type")
+    odometry: str = setting(
+        "", doc="topic of the vehicle's own filter (Odometry, PoseStamped); empty: found"
+    )
+    fix: str = setting("", doc="topic of position fixes (USBL, GNSS); empty: found by its type")
+
+    def chosen(self) -> dict[str, str]:
+        """Topics that are set, by role."""
+        values = {f.name: str(getattr(self, f.name)) for f in dataclass_fields(self)}
+        return {role: topic for role, topic in values.items() if topic}
+
+    @classmethod
+    def of_options(cls, options: Iterable[str]) -> TopicsConfig:
+        """From texts ``ROLE=TOPIC``; `ConfigError` names one that is not of that form."""
+        values = {}
+        for text in options:
+            role, is_set, topic = text.partition("=")
+            role = _SAME_ROLE.get(role, role)
+            if not is_set or not topic or role not in _SENSORS:
+                raise ConfigError(
+                    f"topic {text!r}: expected ROLE=TOPIC with a role of {', '.join(_SENSORS)}"
+                )
+            values[role] = topic
+        return cls(**values)
+
+    def over(self, other: TopicsConfig) -> TopicsConfig:
+        """These topics, and those of `other` where none is set here."""
+        return TopicsConfig(**(other.chosen() | self.chosen()))
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleTopics:
+    """One vehicle's topics.
+
+    Parameters
+    ----------
+    vehicle_id : its name.
+    namespace : what its topics begin with, without slashes at the ends; "" where they share none.
+    topics : role -> topic; `truth` and those of `_SENSORS` that were found.
+    tables : indices of the tables (bags) that hold messages of it.
+    unused : topics that could have played a role, and why they do not.
+    """
+
+    vehicle_id: str
+    namespace: str
+    topics: dict[str, str]
+    tables: tuple[int, ...]
+    unused: dict[str, str] = field(default_factory=dict)
+
+
+def roles_of_type(msgtype: str) -> tuple[str, ...]:
+    """Roles that a topic of this type can play; none for a type that nobody here reads."""
+    return _TYPES.get(msgtype, ())
+
+
+def parts_of(topic: str) -> list[str]:
+    """Components of a topic's name."""
+    return topic.strip("/").split("/")
+
+
+def find_vehicles(
+    tables: Sequence[Mapping[str, str]],
+    names: Sequence[str],
+    chosen: Mapping[str, TopicsConfig] | TopicsConfig = TopicsConfig(),
+) -> list[VehicleTopics]:
+    """Vehicles in tables of topics, and what plays which role for each.
+
+    Parameters
+    ----------
+    tables : topic -> type of every topic that has messages, one table for each bag (or one for a
+        live graph).
+    names : a name for each table, for vehicles whose topics have no namespace.
+    chosen : topics that are set, for all vehicles or by vehicle.
+
+    Returns
+    -------
+    list[VehicleTopics]
+        In order of their names. Tables whose topics have the same namespace are one vehicle's.
+
+    Raises
+    ------
+    DataError
+        If two topics could equally well play a role, naming both and what to write; if a topic
+        that is set is not there, or has a type that cannot play its role.
+    """
+    namespaces: dict[tuple[str, str], list[int]] = {}
+    shared = _first_of_parts(tables, names)
+    for index, (table, name) in enumerate(zip(tables, names, strict=True)):
+        for namespace in _namespaces(table):
+            vehicle_id = parts_of(namespace)[-1] if namespace else shared or name
+            namespaces.setdefault((vehicle_id, namespace), []).append(index)
+    ids = [vehicle_id for vehicle_id, _ in namespaces]
+    vehicles = []
+    for (vehicle_id, namespace), indices in sorted(namespaces.items()):
+        if ids.count(vehicle_id) > 1 and namespace:
+            vehicle_id = namespace.replace("/", "_")
+        table = {topic: typ for index in indices for topic, typ in tables[index].items()}
+        others = [n for _, n in namespaces if n != namespace and _is_below(n, namespace)]
+        is_alone = len(namespaces) == 1
+        mine = chosen if isinstance(chosen, TopicsConfig) else chosen.get(vehicle_id)
+        topics, unused = topics_of(
+            table, vehicle_id, namespace, mine or TopicsConfig(), others, is_alone=is_alone
+        )
+        vehicles.append(VehicleTopics(vehicle_id, namespace, topics, tuple(indices), unused))
+    return vehicles
+
+
+def topics_of(
+    table: Mapping[str, str],
+    vehicle_id: str,
+    namespace: str,
+    chosen: TopicsConfig,
+    others: Sequence[str] = (),
+    *,
+    is_alone: bool = True,
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Role -> topic of one vehicle, and topics that were left out -> why.
+
+    `others` are namespaces of other vehicles below this one. A vehicle that `is_alone` may have
+    sensors outside its namespace.
+    """
+    mine = {
+        topic: msgtype
+        for topic, msgtype in table.items()
+        if _is_below(topic, namespace) and not any(_is_below(topic, other) for other in others)
+    }
+    topics: dict[str, str] = {}
+    unused: dict[str, str] = {}
+    set_topics = chosen.chosen()
+    for role in (*_SENSORS, "truth"):
+        if role in set_topics:
+            topics[role] = _set_topic(table, vehicle_id, namespace, role, set_topics[role])
+            continue
+        found = _candidates(mine, role, namespace)
+        is_needless = role == "odometry" and "velocity" in topics
+        if not found and is_alone and role != "truth" and not is_needless:
+            found = _candidates(table, role, "")
+        if not found:
+            continue
+        best = found[0]
+        if len(found) > 1 and role in _REQUIRED and found[1][:-1] == best[:-1]:
+            if role == "odometry" and {"velocity", "imu"} <= set(topics):
+                continue  # not needed
+            raise DataError(
+                f"{vehicle_id}: two topics could be its {WORDS.get(role, role)}: {best[-1]} and "
+                f"{found[1][-1]}; say which, with --topic {role}={best[-1]}, or in the settings "
+                f"with topics: {{{role}: {best[-1]}}}"
+            )
+        topics[role] = best[-1]
+        unused |= {c[-1]: f"{topics[role]} is the {WORDS.get(role, role)}" for c in found[1:]}
+    return topics, {topic: why for topic, why in unused.items() if topic not in topics.values()}
+
+
+def _set_topic(
+    table: Mapping[str, str], vehicle_id: str, namespace: str, role: str, topic: str
+) -> str:
+    full = topic if topic.startswith("/") else f"/{namespace}/{topic}".replace("//", "/")
+    if full not in table:
+        raise DataError(
+            f"{vehicle_id}: no topic {full} for its {WORDS.get(role, role)}; there are "
+            f"{', '.join(sorted(table))}"
+        )
+    if role not in roles_of_type(table[full]):
+        raise DataError(
+            f"{vehicle_id}: topic {full} has type {table[full]}, which cannot be its "
+            f"{WORDS.get(role, role)}"
+        )
+    return full
+
+
+_Rank = tuple[int, int, int, int, str]
+
+
+def _candidates(table: Mapping[str, str], role: str, namespace: str) -> list[_Rank]:
+    """Topics that can play a role, best first: (type, name, level, raw, topic)."""
+    depth = len(parts_of(namespace)) if namespace else 0
+    found: list[_Rank] = []
+    for topic, msgtype in table.items():
+        parts = [part.lower() for part in parts_of(topic)]
+        is_truth = bool(_TRUTH & set(parts))
+        if role == "truth":
+            if is_truth and "odometry" in roles_of_type(msgtype):
+                found.append((0, 0, len(parts), 0, topic))
+            continue
+        if is_truth or role not in roles_of_type(msgtype) or _NO_MEASUREMENT & set(parts[depth:]):
+            continue
+        own = parts[depth:]
+        words = _NAMES[role]
+        if own == [words[0]] or (len(own) == 1 and own[0] in words):
+            name = 0
+        else:
+            name = 1 if any(word in part for part in own for word in words) else 2
+        if name == 2 and msgtype in _NEEDS_A_NAME:
+            continue
+        is_raw = any("raw" in part or "debug" in part for part in own)
+        found.append((_GENERAL_TYPES.get(msgtype, 0), name, len(own), int(is_raw), topic))
+    return sorted(found)
+
+
+def _first_of_parts(tables: Sequence[Mapping[str, str]], names: Sequence[str]) -> str:
+    """Name for tables that are parts of one vehicle (its sonar, its navigation), or ""."""
+    bare = [i for i, table in enumerate(tables) if _namespaces(table) == [""]]
+    roles = [
+        {role for topic, typ in tables[i].items() for role in roles_of_type(typ)} for i in bare
+    ]
+    is_split = [bool("sonar" in r) != bool(r & _NAVIGATION) for r in roles]
+    return names[bare[0]] if len(bare) > 1 and all(is_split) else ""
+
+
+# --- whose it is
+# -----------------------------------------------------------------------------------------------
+
+
+def _is_below(topic: str, namespace: str) -> bool:
+    return not namespace or topic.strip("/").startswith(f"{namespace}/")
+
+
+def _namespaces(table: Mapping[str, str]) -> list[str]:
+    """Namespaces of the vehicles of one table; [""] where there is nothing to tell it by."""
+    sensors: dict[tuple[str, ...], set[str]] = {}
+    for topic, msgtype in table.items():
+        parts = parts_of(topic)
+        roles = {role for role in roles_of_type(msgtype) if role in _SENSORS}
+        lowered = {part.lower() for part in parts}
+        if roles and not lowered & (_TRUTH | _NO_MEASUREMENT):
+            sensors[tuple(parts)] = roles
+    return ["/".join(found) for found in _split(sensors, ())]
+
+
+def _split(
+    sensors: Mapping[tuple[str, ...], set[str]], prefix: tuple[str, ...]
+) -> list[tuple[str, ...]]:
+    """Prefixes of vehicles: as deep as nothing that a vehicle needs is lost on the way."""
+    here = {parts: roles for parts, roles in sensors.items() if parts[: len(prefix)] == prefix}
+    children: dict[str, set[str]] = {}
+    for parts, roles in here.items():
+        if len(parts) > len(prefix) + 1:
+            children.setdefault(parts[len(prefix)], set()).update(roles)
+    outside = set().union(*(r for p, r in here.items() if len(p) == len(prefix) + 1))
+    if len(children) == 1 and not outside:
+        return _split(sensors, (*prefix, next(iter(children))))
+    complete = {c for c, roles in children.items() if "sonar" in roles and roles & _NAVIGATION}
+    incomplete = set().union(outside, *(r for c, r in children.items() if c not in complete))
+    if complete and all(_has_all(children[child], incomplete) for child in complete):
+        return [found for child in sorted(complete) for found in _split(sensors, (*prefix, child))]
+    return [_before_a_sensor(prefix)]
+
+
+def _has_all(roles: set[str], others: set[str]) -> bool:
+    """Whether a vehicle with these roles needs none of the others."""
+    if "velocity" not in roles and "odometry" not in roles and others & {"velocity", "odometry"}:
+        return False
+    return "imu" in roles or "imu" not in others
+
+
+def _before_a_sensor(prefix: tuple[str, ...]) -> tuple[str, ...]:
+    """A lone ``/auv_1/imu/data`` is in namespace auv_1, not auv_1/imu."""
+    words = {word for group in _NAMES.values() for word in group} | {"mavros"}
+    while prefix and prefix[-1].lower() in words:
+        prefix = prefix[:-1]
+    return prefix
