@@ -10,6 +10,7 @@ from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_poi
 from uw_dslam_ros2.core.mapping.occupancy import CompressedGrid, LogOddsGrid
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.suppression import first_apart
 
 __all__ = ["conflict", "rivals", "without_direction"]
 
@@ -122,15 +123,15 @@ def _distance(prior: Prior, pose: SE2) -> float:
 
 def _peaks(scores: FloatArray, num: int, step: float) -> FloatArray:
     """Offsets (K, 2) [x, y] of the best local maxima, best first, apart from each other."""
-    left = scores.copy()
-    peaks = []
-    for _ in range(_MAX_PEAKS):
-        row, col = np.unravel_index(int(np.argmax(left)), left.shape)
-        if left[row, col] <= 0.0:
-            break
-        peaks.append(((int(col) - num) * step, (int(row) - num) * step))
-        left[max(0, row - 3) : row + 4, max(0, col - 3) : col + 4] = 0.0
-    return np.array(peaks).reshape(-1, 2)
+    rows, cols = np.unravel_index(np.argsort(-scores, axis=None, kind="stable"), scores.shape)
+    is_positive = scores[rows, cols] > 0.0
+    rows, cols = rows[is_positive], cols[is_positive]
+    peaks = first_apart(
+        len(rows),
+        lambda k: (np.abs(rows - rows[k]) <= 3) & (np.abs(cols - cols[k]) <= 3),
+        _MAX_PEAKS,
+    )
+    return step * np.column_stack([cols[peaks] - num, rows[peaks] - num]).astype(np.float64)
 
 
 def _quality(met: int, against: int) -> float:

@@ -12,6 +12,8 @@ from scipy import fft
 from uw_dslam_ros2.core.registration.grids import landscape_kernels
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grids.signed_field import PAD
+from uw_dslam_ros2.core.se2 import wrap_angle
+from uw_dslam_ros2.core.suppression import first_apart
 
 __all__ = ["Landscape", "distinct", "scan_landscape"]
 
@@ -77,11 +79,13 @@ def _rotations(num_rotations: int, window: PoseWindow | None) -> FloatArray:
 
 def distinct(poses: FloatArray, radius: float, separation_cells: float, limit: int) -> list[int]:
     """Indices of the first poses (K, 3) that are apart from those before, in place or turn."""
-    kept = np.empty(min(limit, len(poses)), np.int64)
-    count = landscape_kernels.first_apart(
-        np.ascontiguousarray(poses), radius, separation_cells, kept
-    )
-    return kept[:count].tolist()
+
+    def is_near(k: int) -> NDArray[np.bool_]:
+        turn = np.abs(wrap_angle(poses[:, 0] - poses[k, 0]))
+        shift = np.hypot(poses[:, 1] - poses[k, 1], poses[:, 2] - poses[k, 2])
+        return (turn * radius < separation_cells) & (shift < separation_cells)
+
+    return first_apart(len(poses), is_near, limit)
 
 
 class _Scan:

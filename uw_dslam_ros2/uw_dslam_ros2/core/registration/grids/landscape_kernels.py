@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["correlate", "draw_turned", "find_peaks", "first_apart", "splat"]
+__all__ = ["correlate", "draw_turned", "find_peaks", "splat"]
 
 FloatGrid = NDArray[np.float32]
 FloatStack = NDArray[np.float32]
@@ -217,27 +217,3 @@ def find_peaks(
                 _column_maxima(image, maxima)
             else:
                 _erase_around(image, maxima, row, col, radius)
-
-
-@njit(cache=True, nogil=True)
-def first_apart(poses: FloatArray, radius: float, separation: float, kept: IntArray) -> int:
-    """Indices of the first poses (K, 3) that are apart from those before, into ``kept``; how many.
-
-    Apart is by ``separation`` in place, or in turn at ``radius``.
-    """
-    count = 0
-    for index in range(poses.shape[0]):
-        is_apart = True
-        for k in range(count):
-            other = poses[kept[k]]
-            turn = abs((other[0] - poses[index, 0] + math.pi) % (2.0 * math.pi) - math.pi)
-            shift = math.hypot(other[1] - poses[index, 1], other[2] - poses[index, 2])
-            if turn * radius < separation and shift < separation:
-                is_apart = False
-                break
-        if is_apart:
-            kept[count] = index
-            count += 1
-            if count == kept.shape[0]:
-                break
-    return count

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration.search import field_kernels
+from uw_dslam_ros2.core.suppression import first_apart
 
 __all__ = ["lattice_maxima", "likelihood_raster", "sum_shifted"]
 
@@ -88,15 +89,9 @@ def _apart(poses: FloatArray, arm_m: float, distance_m: float, count: int) -> Fl
     places = np.column_stack(
         [arm_m * np.cos(poses[:, 0]), arm_m * np.sin(poses[:, 0]), poses[:, 1:]]
     )
-    is_taken = np.zeros(len(poses), dtype=np.bool_)
-    chosen: list[int] = []
-    for k in range(len(poses)):
-        if is_taken[k]:
-            continue
-        chosen.append(k)
-        if len(chosen) == count:
-            break
-        is_taken |= np.abs(places - places[k]).max(axis=1) < distance_m
+    chosen = first_apart(
+        len(poses), lambda k: np.abs(places - places[k]).max(axis=1) < distance_m, count
+    )
     return poses[chosen]
 
 

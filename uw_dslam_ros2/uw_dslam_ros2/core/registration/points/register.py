@@ -42,6 +42,7 @@ from uw_dslam_ros2.core.registration.search.branch_and_bound import (
 )
 from uw_dslam_ros2.core.registration.search.field import likelihood_field, mixture_field
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
+from uw_dslam_ros2.core.suppression import first_apart
 
 __all__ = ["register_point_sets"]
 
@@ -349,16 +350,13 @@ class _Match:
         """Best first, each pose once."""
         ordered = sorted(found, key=lambda pair: -pair[0])
         poses = np.array([refinement.parameters for _, refinement in ordered])
-        is_near = np.zeros(len(ordered), dtype=np.bool_)
-        kept: list[Candidate] = []
-        for k, pair in enumerate(ordered):
-            if is_near[k]:
-                continue
-            kept.append(pair)
+
+        def is_near(k: int) -> NDArray[np.bool_]:
             turn = np.abs(wrap_angle(poses[:, 0] - poses[k, 0]))
             shift = np.hypot(poses[:, 1] - poses[k, 1], poses[:, 2] - poses[k, 2])
-            is_near |= shift + turn * self._arm_m <= 0.5 * self._spacing_m
-        return kept
+            return np.asarray(shift + turn * self._arm_m <= 0.5 * self._spacing_m)
+
+        return [ordered[k] for k in first_apart(len(ordered), is_near)]
 
     def _polished(self, candidate: Candidate) -> Candidate:
         refinement = polish(self._model, candidate[1])

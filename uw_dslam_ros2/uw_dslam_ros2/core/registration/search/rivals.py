@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration.search.problem import Problem
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
+from uw_dslam_ros2.core.suppression import first_apart
 
 __all__ = ["Neighborhoods"]
 
@@ -72,11 +73,11 @@ class Neighborhoods:
 
     def apart_from_better(self, distance_m: float) -> NDArray[np.int64]:
         """Indices of the optima further than that from every better one that was chosen."""
-        chosen: list[int] = []
-        for k in range(len(self.optima)):
-            distances = self._distances(self.optima[k, 1:])[chosen]
-            if (distances > distance_m).all() and np.isfinite(self.optima[k, 0]):
-                chosen.append(k)
+        num_finite = int(np.isfinite(self.optima[:, 0]).sum())  # best first, so they are the first
+        chosen = first_apart(
+            num_finite,
+            lambda k: self._distances(self.optima[k, 1:])[:num_finite] <= distance_m,
+        )
         return np.array(chosen, dtype=np.int64)
 
     def _distances(self, pose: FloatArray) -> FloatArray:
