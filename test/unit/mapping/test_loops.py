@@ -124,6 +124,15 @@ def test_covariance_without_loops_is_that_of_the_steps():
     np.testing.assert_allclose(graph.covariance(), expected, rtol=0.02, atol=1e-3)
 
 
+def test_a_loop_narrows_the_search_for_the_next_one_at_once():
+    graph, _, _ = graph_of()
+    pose, blind = graph.relative(1, 5)
+    graph.add_loop(0, 4, SE2(0.05, -0.04, 0.0), np.diag([400.0, 400.0, 1e4]))
+    same, narrow = graph.relative(1, 5)
+    assert same == pose
+    assert np.trace(narrow[:2, :2]) < 0.5 * np.trace(blind[:2, :2])
+
+
 def test_a_loop_shrinks_the_covariance_and_a_false_one_does_not():
     graph, _, _ = graph_of()
     blind = np.trace(graph.covariance()[:2, :2])

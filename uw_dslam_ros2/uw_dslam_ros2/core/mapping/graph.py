@@ -57,9 +57,15 @@ class SubmapGraph:
     def add_loop(
         self, target: int, source: int, T_target_source: SE2, information: FloatArray
     ) -> None:
-        """A match between two submaps; information (3, 3) in the target frame."""
+        """A match between two submaps, believed until `optimize` says otherwise.
+
+        Information (3, 3) is in the target frame.
+        """
         covariance = np.linalg.inv(information + _NOTHING)
-        self._loops[target, source] = Edge(source, target, T_target_source, covariance)
+        loop = Edge(source, target, T_target_source, covariance)
+        self._loops[target, source] = loop
+        self._believed.append(loop)
+        self._marginals = None
 
     def covariance(self) -> FloatArray:
         """Covariance (3, 3) of the newest submap's pose in odom, order x, y, yaw."""
