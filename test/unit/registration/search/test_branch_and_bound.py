@@ -60,8 +60,8 @@ def bound_box(problem, box, floor=-math.inf):
     box, out = np.asarray(box), np.empty(5)
     cells = np.empty((4, problem.points.shape[1]), dtype=np.int32)
     first = kernels.bound_first(problem.sum, problem.bounds.windows, box, floor, cells)
-    room = np.empty((14, problem.points.shape[1]))
-    kernels.bound_second(problem.sum, problem.bounds.curvatures, box, out, cells, room)
+    scratch = np.empty((14, problem.points.shape[1]))
+    kernels.bound_second(problem.sum, problem.bounds.curvatures, box, out, cells, scratch)
     return first, out[0], out[1]
 
 

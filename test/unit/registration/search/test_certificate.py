@@ -300,8 +300,8 @@ def bounds_of(problem, box, floor):
         kernels.bound_first(problem.sum, problem.bounds.windows, box, lowest, cells)
         for lowest in (-math.inf, floor)
     )  # fmt: skip
-    room = np.empty((14, problem.points.shape[1]))
-    kernels.bound_second(problem.sum, problem.bounds.curvatures, box, out, cells, room)
+    scratch = np.empty((14, problem.points.shape[1]))
+    kernels.bound_second(problem.sum, problem.bounds.curvatures, box, out, cells, scratch)
     return first, early, out[0]
 
 

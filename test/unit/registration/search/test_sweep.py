@@ -127,7 +127,7 @@ def meetings(problem, count, rng):
 def bound_slowly(problem, box, more=0.0):
     """Sum over the points of the largest cell in the square that each can reach, `more` [m]."""
     total, (theta, x, y, delta, *half) = 0.0, box
-    swing, bow = math.sin(min(delta, math.pi / 2)), 0.5 * (1.0 - math.cos(delta))
+    max_sin, versine = math.sin(min(delta, math.pi / 2)), 0.5 * (1.0 - math.cos(delta))
     turn = SE2(0.0, 0.0, theta).rotation()
     for term, row, (x0, y0, pitch_m, *_) in zip(
         problem.terms, problem.rows, problem.frames, strict=True
@@ -137,12 +137,12 @@ def bound_slowly(problem, box, more=0.0):
         ):
             if term.is_inverse:
                 turned, middle = turn.T @ (point - [x, y]), np.zeros(2)
-                reach = np.abs(turn.T) @ half * (1.0 + 2.0 * bow)
-                reach += swing * (np.abs(turn.T) @ half)[::-1]
+                reach = np.abs(turn.T) @ half * (1.0 + 2.0 * versine)
+                reach += max_sin * (np.abs(turn.T) @ half)[::-1]
             else:
                 turned, middle, reach = turn @ point, np.array([x, y]), np.array(half)
-            reach = reach + swing * np.abs(turned[::-1]) + bow * np.abs(turned) + more
-            middle = (1.0 - bow) * turned + middle - [x0, y0]
+            reach = reach + max_sin * np.abs(turned[::-1]) + versine * np.abs(turned) + more
+            middle = (1.0 - versine) * turned + middle - [x0, y0]
             low = np.floor((middle - reach) / pitch_m + 0.5 - 1e-9).astype(int)
             high = np.floor((middle + reach) / pitch_m + 0.5 + 1e-9).astype(int) + 1
             high = low + WIDTHS[np.searchsorted(WIDTHS, (high - low).max())]

@@ -91,12 +91,12 @@ class State(NamedTuple):
 def _turn(box):
     """Cosine and sine of the centre's turn; largest sin(delta) and 1 - cos(delta) beside it."""
     half = min(box[3], math.pi)
-    swing = math.sin(half) if half < 0.5 * math.pi else 1.0
-    return math.cos(box[0]), math.sin(box[0]), swing, 1.0 - math.cos(half)
+    max_sin = math.sin(half) if half < 0.5 * math.pi else 1.0
+    return math.cos(box[0]), math.sin(box[0]), max_sin, 1.0 - math.cos(half)
 
 
 @njit(cache=True, nogil=True)
-def _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells):
+def _rectangles(points, terms, frames, t, box, cos, sin, max_sin, versine, cells):
     """Cells that a term's points can reach: first column and row, last column and row.
 
     A turn by delta moves a turned point r by sin(delta) J r - (1 - cos(delta)) r. What lies beyond
@@ -108,27 +108,27 @@ def _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells):
     shift_x, shift_y = 0.5 - frames[t, 0] * scale, 0.5 - frames[t, 1] * scale
     right, top = terms[t, 5] - 1.0, terms[t, 4] - 1.0
     tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
-    bow *= 0.5
+    versine *= 0.5
     if terms[t, 2] != 0:
         # The box of translations is turned, too, the other way round.
         origin_x, origin_y, sin = tx, ty, -sin
         e_x = scale * (abs(cos) * h_x + abs(sin) * h_y)
         e_y = scale * (abs(sin) * h_x + abs(cos) * h_y)
-        reach_x = e_x * (1.0 + 2.0 * bow) + swing * e_y + rounding
-        reach_y = e_y * (1.0 + 2.0 * bow) + swing * e_x + rounding
+        reach_x = e_x * (1.0 + 2.0 * versine) + max_sin * e_y + rounding
+        reach_y = e_y * (1.0 + 2.0 * versine) + max_sin * e_x + rounding
     else:
         origin_x, origin_y = 0.0, 0.0
         shift_x, shift_y = shift_x + scale * tx, shift_y + scale * ty
         reach_x, reach_y = scale * h_x + rounding, scale * h_y + rounding
-    c, s, stay = cos * scale, sin * scale, 1.0 - bow
+    c, s, stay = cos * scale, sin * scale, 1.0 - versine
     xs, ys = points[0, first:end], points[1, first:end]
     low_x, low_y, high_x, high_y = cells[0], cells[1], cells[2], cells[3]
     for k in range(end - first):
         x, y = xs[k] - origin_x, ys[k] - origin_y
         rx, ry = c * x - s * y, s * x + c * y
         u, v = stay * rx + shift_x, stay * ry + shift_y
-        half_x = reach_x + swing * abs(ry) + bow * abs(rx)
-        half_y = reach_y + swing * abs(rx) + bow * abs(ry)
+        half_x = reach_x + max_sin * abs(ry) + versine * abs(rx)
+        half_y = reach_y + max_sin * abs(rx) + versine * abs(ry)
         low_x[k] = np.int32(min(max(u - half_x, 0.0), right))
         low_y[k] = np.int32(min(max(v - half_y, 0.0), top))
         high_x[k] = np.int32(min(max(u + half_x, 0.0), right))
@@ -143,10 +143,10 @@ def bound_first(total, windows, box, floor, cells):
     ``cells`` (4, K) of int32 is scratch.
     """
     points, terms, frames, upper = total.points, total.terms, total.frames, 0.0
-    cos, sin, swing, bow = _turn(box)
+    cos, sin, max_sin, versine = _turn(box)
     for t in range(terms.shape[0]):
         first, count = terms[t, 0], terms[t, 1] - terms[t, 0]
-        _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells)
+        _rectangles(points, terms, frames, t, box, cos, sin, max_sin, versine, cells)
         _find_corners(cells, count, terms[t, 5], terms[t, 4] * terms[t, 5])
         lows, rights, ups = cells[0], cells[1], cells[2]
         for k in range(count):
@@ -197,14 +197,21 @@ def _largest_of(windows, at, right, up):
 @njit(cache=True, nogil=True)
 def _find_places(
     points, first, count, is_inverse, cos, sin, tx, ty, scale, shift_x, shift_y, num_rows,
-    num_cols, cells, room,
+    num_cols, cells, scratch,
 ):  # fmt: skip
-    """Turned points, places between nodes, weights (0 outside) into ``room[:5]``.
+    """Turned points, places between nodes, weights (0 outside) into ``scratch[:5]``.
 
     The nodes go into ``cells[3]``.
     """
     xs, ys, weights = points[0, first:], points[1, first:], points[2, first:]
-    rxs, rys, us, vs, inside, nodes = room[0], room[1], room[2], room[3], room[4], cells[3]
+    rxs, rys, us, vs, inside, nodes = (
+        scratch[0],
+        scratch[1],
+        scratch[2],
+        scratch[3],
+        scratch[4],
+        cells[3],
+    )
     origin_x, origin_y = 0.0, 0.0
     if is_inverse:
         origin_x, origin_y, sin = tx, ty, -sin
@@ -277,12 +284,12 @@ def spline_values(coefficients, nodes):
 
 
 @njit(cache=True, nogil=True)
-def _fill_splines(coefficients, at, num_cols, scale, count, nodes, room):
-    """Weighted values and slopes of the field into ``room[5:8]``."""
+def _fill_splines(coefficients, at, num_cols, scale, count, nodes, scratch):
+    """Weighted values and slopes of the field into ``scratch[5:8]``."""
     at, cols = np.uint64(at), np.uint64(num_cols)
     one, two, twice = np.uint64(1), np.uint64(2), np.uint64(2 * num_cols)
-    n00, n01, n02, n10, n11 = room[5], room[6], room[7], room[8], room[9]
-    n12, n20, n21, n22 = room[10], room[11], room[12], room[13]
+    n00, n01, n02, n10, n11 = scratch[5], scratch[6], scratch[7], scratch[8], scratch[9]
+    n12, n20, n21, n22 = scratch[10], scratch[11], scratch[12], scratch[13]
     # Fetched first and counted afterwards, which the compiler does with vector instructions.
     for k in range(count):
         low = at + np.uint64(nodes[k])
@@ -292,7 +299,7 @@ def _fill_splines(coefficients, at, num_cols, scale, count, nodes, room):
         n11[k], n12[k] = coefficients[mid + one], coefficients[mid + two]
         n20[k], n21[k] = coefficients[high], coefficients[high + one]
         n22[k] = coefficients[high + two]
-    along, across, weights = room[2], room[3], room[4]
+    along, across, weights = scratch[2], scratch[3], scratch[4]
     for k in range(count):
         value, slope_x, slope_y, _, _, _ = _spline(
             along[k], across[k], n00[k], n01[k], n02[k], n10[k], n11[k], n12[k], n20[k], n21[k],
@@ -305,12 +312,12 @@ def _fill_splines(coefficients, at, num_cols, scale, count, nodes, room):
 
 
 @njit(cache=True, nogil=True)
-def bound_second(total, curvatures, box, out, cells, room):
+def bound_second(total, curvatures, box, out, cells, scratch):
     """Upper bound over a small box from value, summed gradient and bounded curvature.
 
     ``out``: the bound, the value at the centre, and the rise that theta, x and y can bring. The
     bound is infinite where the box is too large for the tables. ``cells`` (4, K) of int32 and
-    ``room`` (14, K) are scratch.
+    ``scratch`` is (14, K).
     """
     points, terms, frames, coefficients = (
         total.points,
@@ -318,7 +325,7 @@ def bound_second(total, curvatures, box, out, cells, room):
         total.frames,
         total.coefficients,
     )
-    cos, sin, swing, bow = _turn(box)
+    cos, sin, max_sin, versine = _turn(box)
     tx, ty, h_x, h_y = box[1], box[2], box[4], box[5]
     value = 0.0
     g_x, g_y, g_theta = 0.0, 0.0, 0.0
@@ -335,21 +342,27 @@ def bound_second(total, curvatures, box, out, cells, room):
         s0, sx, sy, s_theta, s_radial = 0.0, 0.0, 0.0, 0.0, 0.0
         la, lx, ly, lc = 0.0, 0.0, 0.0, 0.0
         first, count = terms[t, 0], terms[t, 1] - terms[t, 0]
-        _rectangles(points, terms, frames, t, box, cos, sin, swing, bow, cells)
+        _rectangles(points, terms, frames, t, box, cos, sin, max_sin, versine, cells)
         if not _find_corners(cells, count, num_cols, plane):
             return
         _find_places(
             points, first, count, is_inverse, cos, sin, tx, ty, scale, shift_x, shift_y,
-            num_rows, num_cols, cells, room,
+            num_rows, num_cols, cells, scratch,
         )  # fmt: skip
-        _fill_splines(coefficients, at_coefficients, num_cols, scale, count, cells[3], room)
-        bends, weights = room[8], points[2, first:]
+        _fill_splines(coefficients, at_coefficients, num_cols, scale, count, cells[3], scratch)
+        bends, weights = scratch[8], points[2, first:]
         lows, rights, ups = cells[0], cells[1], cells[2]
         for k in range(count):
             bends[k] = weights[k] * _largest_of(
                 curvatures, at_curvatures + lows[k], rights[k], ups[k]
             )
-        rxs, rys, values, slopes_x, slopes_y = room[0], room[1], room[5], room[6], room[7]
+        rxs, rys, values, slopes_x, slopes_y = (
+            scratch[0],
+            scratch[1],
+            scratch[5],
+            scratch[6],
+            scratch[7],
+        )
         for k in range(count):
             rx, ry, curvature = rxs[k], rys[k], bends[k]
             fx, fy = slopes_x[k], slopes_y[k]
@@ -386,17 +399,17 @@ def bound_second(total, curvatures, box, out, cells, room):
             e_y += ly
     # f <= f0 + g d + 1/2 d^T M d over |d| <= h, the mixed terms split between the axes.
     q_x, q_y, q_theta = all_a, all_a, m33
-    if swing > 0.0:
+    if max_sin > 0.0:
         if h_x > 0.0:
-            q_x += abs(b_x) * swing / h_x
-            q_theta += abs(b_x) * h_x / swing
+            q_x += abs(b_x) * max_sin / h_x
+            q_theta += abs(b_x) * h_x / max_sin
         if h_y > 0.0:
-            q_y += abs(b_y) * swing / h_y
-            q_theta += abs(b_y) * h_y / swing
-    out[2] = _parabola(abs(g_theta), q_theta, swing)
+            q_y += abs(b_y) * max_sin / h_y
+            q_theta += abs(b_y) * h_y / max_sin
+    out[2] = _parabola(abs(g_theta), q_theta, max_sin)
     out[3] = _parabola(abs(g_x), q_x, h_x)
     out[4] = _parabola(abs(g_y), q_y, h_y)
-    rest = 0.5 * bow * bow * max(m33, 0.0) + bow * (abs(e_x) * h_x + abs(e_y) * h_y)
+    rest = 0.5 * versine * versine * max(m33, 0.0) + versine * (abs(e_x) * h_x + abs(e_y) * h_y)
     out[0] = value + out[2] + out[3] + out[4] + rest
     out[1] = value
 
@@ -689,7 +702,7 @@ def _bound(total, bounds, state, box, key, is_unseen, keep, wanted, scratch):
     Curvature is asked where it could take the bound below ``wanted``. Where it does not, the
     centre may be worth a climb.
     """
-    out, work, cells, room = scratch
+    out, work, cells, scratch = scratch
     best, worth, margin = state.best, state.worth, bounds.margin
     first = key
     if not is_unseen:
@@ -706,7 +719,7 @@ def _bound(total, bounds, state, box, key, is_unseen, keep, wanted, scratch):
     is_tried = is_unseen or wanted < best[0] or worth[level] > 0.7
     if not is_tried and state.counters[NUM_BOXES] & 14 != 0:
         return upper
-    bound_second(total, bounds.curvatures, box, out, cells, room)
+    bound_second(total, bounds.curvatures, box, out, cells, scratch)
     gain = (first - max(out[0] + margin, wanted)) / (first - wanted)
     worth[level] += _LEARNING * (max(gain, 0.0) - worth[level])
     upper = min(upper, out[0] + margin)
@@ -753,8 +766,8 @@ def _limit(state, budget):
 @njit(cache=True, nogil=True)
 def _make_scratch(total):
     num_points = total.points.shape[1]
-    cells, room = np.empty((4, num_points), np.int32), np.empty((14, num_points))
-    return np.empty(5), np.empty((11, 3)), cells, room
+    cells, scratch = np.empty((4, num_points), np.int32), np.empty((14, num_points))
+    return np.empty(5), np.empty((11, 3)), cells, scratch
 
 
 @njit(cache=True, nogil=True)

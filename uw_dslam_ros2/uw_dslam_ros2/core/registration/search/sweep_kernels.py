@@ -175,8 +175,8 @@ def _forward_places(
     others, and the sum of the weights that are left out.
     """
     scale = 1.0 / (frame[2] * size)
-    swing = math.sin(delta) if delta < 0.5 * math.pi else 1.0
-    bow = 0.5 * (1.0 - math.cos(min(delta, math.pi)))
+    max_sin = math.sin(delta) if delta < 0.5 * math.pi else 1.0
+    versine = 0.5 * (1.0 - math.cos(min(delta, math.pi)))
     shift_x = (origin[0] - frame[0]) * scale + 0.5 / size
     shift_y = (origin[1] - frame[1]) * scale + 0.5 / size
     cos, sin, reach = math.cos(theta) * scale, math.sin(theta) * scale, half * scale + frame[3]
@@ -185,9 +185,9 @@ def _forward_places(
         at = first_point + k
         x, y, weight = points[0, at], points[1, at], points[2, at]
         rx, ry = cos * x - sin * y, sin * x + cos * y
-        half_x = reach + swing * abs(ry) + bow * abs(rx)
-        half_y = reach + swing * abs(rx) + bow * abs(ry)
-        u, v = (1.0 - bow) * rx + shift_x, (1.0 - bow) * ry + shift_y
+        half_x = reach + max_sin * abs(ry) + versine * abs(rx)
+        half_y = reach + max_sin * abs(rx) + versine * abs(ry)
+        u, v = (1.0 - versine) * rx + shift_x, (1.0 - versine) * ry + shift_y
         col, row = math.floor(u - half_x), math.floor(v - half_y)
         width, height = math.floor(u + half_x) - col + 1, math.floor(v + half_y) - row + 1
         slot = -1
@@ -281,8 +281,8 @@ def turned_maxima(
     num_rows, num_cols = tables.shape[1], tables.shape[2]
     rows, cols = single.shape
     cos, sin = math.cos(theta), math.sin(theta)
-    swing = math.sin(delta) if delta < 0.5 * math.pi else 1.0
-    bow = 0.5 * (1.0 - math.cos(min(delta, math.pi)))
+    max_sin = math.sin(delta) if delta < 0.5 * math.pi else 1.0
+    versine = 0.5 * (1.0 - math.cos(min(delta, math.pi)))
     corner = math.sqrt(2.0)
     half = 0.5 * fold * min(corner, abs(cos) + abs(sin) + corner * delta) + slack
     end_x, end_y = num_cols - 1.0, num_rows - 1.0
@@ -293,14 +293,14 @@ def turned_maxima(
     widest = np.int32(layers.shape[0] - 1)
     first_row, first_col = frame[0], frame[1]
     first_u, last_u = fold * first_col, fold * (first_col + cols)
-    far_u, stay = max(abs(first_u), abs(last_u)), 1.0 - bow
+    far_u, stay = max(abs(first_u), abs(last_u)), 1.0 - versine
     x0, y0 = shift[0], shift[1]
     for row in range(rows):
         uy = fold * (first_row + row + 0.5)
         line = single[row]
         line[:] = 0
         # A square can meet the field where its middle, less what it reaches, is inside.
-        reach = half + (abs(uy) + far_u) * (swing + 2.0 * bow)
+        reach = half + (abs(uy) + far_u) * (max_sin + 2.0 * versine)
         low, high = _clip(
             content[0] - reach - x0 - sin * uy, content[2] + reach - x0 - sin * uy, cos,
             first_u, last_u,
@@ -314,8 +314,8 @@ def turned_maxima(
         for col in range(begin, end):
             ux = first_u + fold * (col + 0.5)
             qx, qy = cos * ux + sin * uy, cos * uy - sin * ux
-            half_x = half + abs(qy) * swing + abs(qx) * bow
-            half_y = half + abs(qx) * swing + abs(qy) * bow
+            half_x = half + abs(qy) * max_sin + abs(qx) * versine
+            half_y = half + abs(qx) * max_sin + abs(qy) * versine
             # Outside of the tables everything is zero; truncation is the floor of the rest.
             x, y = stay * qx + x0, stay * qy + y0
             left = np.int32(min(max(x - half_x, 0.0), end_x))
