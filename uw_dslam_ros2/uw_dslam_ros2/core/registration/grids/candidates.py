@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration.grids.landscape import Landscape, distinct, scan_landscape
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid, carried
 from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome
 from uw_dslam_ros2.core.se2 import wrap_angle
 
 __all__ = ["Candidate", "Chance", "climb", "log_volume", "merge_best", "scan_candidates"]
 
 FloatArray = NDArray[np.float64]
+_NUM_PEAKS = 300  # of the scan: at 65 cells that is most of them
 _NUM_CANDIDATES = 40
 _OWN_PEAK_CELLS = 6.0
+_LEAST_OTHERS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,14 +43,28 @@ class Chance:
         return (score - self.mean) / self.spread
 
 
-def scan_candidates(problem: GridProblem, window: PoseWindow) -> tuple[list[Candidate], Chance]:
-    """Local maxima of a window, best first, and what chance reaches."""
-    landscape = scan_landscape(problem, _NUM_CANDIDATES, window)
-    candidates = climb(problem, landscape.poses)
-    candidates = [c for c in candidates if _is_inside(window, c.pose)]
-    if not candidates:
-        candidates = [Candidate(window.middle, problem.value(window.middle))]
-    return candidates, _chance(candidates[0], landscape, problem.radius)
+def scan_candidates(
+    pyramid: Pyramid, window: PoseWindow, num_peaks: int = _NUM_PEAKS
+) -> tuple[list[Candidate], Chance]:
+    """Local maxima of the searched problem, best first, and what chance reaches.
+
+    ``window`` is in cells of the scanned problem. There, a thin wall is hardly more than the free
+    space beside it, and the true pose may score below many others; so many of its peaks are
+    carried to the searched problem, whose scores say which of them go on.
+    """
+    scanned, searched = pyramid.scanned, pyramid.searched
+    landscape = scan_landscape(scanned, num_peaks, window)
+    peaks = [c for c in climb(scanned, landscape.poses) if _is_inside(window, c.pose)]
+    if not peaks:
+        peaks = [Candidate(window.middle, scanned.value(window.middle))]
+    chance = _chance(peaks[0], landscape, scanned.radius)
+    poses = np.array([peak.pose for peak in peaks])
+    if searched is scanned:
+        return peaks[:_NUM_CANDIDATES], chance
+    climbed = climb(searched, carried(scanned, searched, poses))
+    back = carried(searched, scanned, np.array([c.pose for c in climbed]))
+    inside = [c for c, pose in zip(climbed, back, strict=True) if _is_inside(window, pose)]
+    return (inside or climbed)[:_NUM_CANDIDATES], chance
 
 
 def climb(problem: GridProblem, poses: FloatArray) -> list[Candidate]:
@@ -71,9 +88,9 @@ def merge_best(
     return [merged[k] for k in distinct(stacked, problem.radius, 1.0, _NUM_CANDIDATES)]
 
 
-def log_volume(problem: GridProblem, window: PoseWindow) -> float:
-    """Logarithm of the number of poses in a window that differ by a cell, at the rim for turns."""
-    sizes = 2.0 * window.half * (problem.radius, 1.0, 1.0)
+def log_volume(pyramid: Pyramid, window: PoseWindow) -> float:
+    """Logarithm of the number of poses in a window that differ by a unit, at the rim for turns."""
+    sizes = 2.0 * window.half * (pyramid.scanned.radius, 1.0, 1.0) / pyramid.unit_cells
     return float(np.log(np.maximum(sizes, 1.0)).sum())
 
 
@@ -90,4 +107,6 @@ def _chance(best: Candidate, landscape: Landscape, radius: float) -> Chance:
         np.hypot(offset[:, 1], offset[:, 2]) < _OWN_PEAK_CELLS
     )
     others = landscape.chance_scores[~is_own]
+    if len(others) < _LEAST_OTHERS:  # nothing is known of chance, so nothing stands out
+        return Chance(best.score, 1.0)
     return Chance(float(np.mean(others)), max(float(np.std(others)), 0.02 * best.score, 1e-9))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ from uw_dslam_ros2.core.registration.grids.probability import (
     pose_logit,
 )
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid, carried
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 __all__ = ["Found", "Judge", "is_same_pose", "refine", "weigh"]
@@ -41,38 +41,37 @@ class Found:
 class Judge:
     """What two maps say about one pose after the other.
 
-    ``levels`` are problems from the searched lattice to the finest one; ``sides`` are source and
-    target on the finest.
+    ``sides`` are source and target on the finest problem's cells.
     """
 
     sides: tuple[WallMap, WallMap]
-    levels: list[GridProblem]
+    pyramid: Pyramid
     chance: Chance
 
     def evidence(self, candidate: Candidate) -> PoseEvidence:
         """Evidence for a pose of the finest level."""
-        work, finest = self.levels[0], self.levels[-1]
+        scanned, finest = self.pyramid.scanned, self.pyramid.finest
         T_grids = finest.to_motion(candidate.pose)
         scale = 1.0 / finest.resolution_m
         T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
-        surprise = self.chance.surprise(work.value(work.to_pose(T_grids)))
+        surprise = self.chance.surprise(scanned.value(scanned.to_pose(T_grids)))
         return PoseEvidence(measure_agreement(*self.sides, T_cells), candidate.score, surprise)
 
 
 def weigh(
     sides: tuple[WallMap, WallMap],
-    levels: list[GridProblem],
+    pyramid: Pyramid,
     window: PoseWindow,
     candidates: list[Candidate],
     chance: Chance,
 ) -> Found:
-    """Refine candidates of the searched lattice on the finest one, and compare them.
+    """Refine candidates of the searched problem on the finest one, and compare them.
 
-    ``sides`` and ``levels`` as for `Judge`.
+    ``sides`` as for `Judge`; ``window`` in cells of the scanned problem.
     """
-    finest, volume = levels[-1], log_volume(levels[0], window)
-    judge = Judge(sides, levels, chance)
-    weighed = [(c, judge.evidence(c)) for c in refine(levels, candidates, _NUM_REFINED)]
+    finest, volume = pyramid.finest, log_volume(pyramid, window)
+    judge = Judge(sides, pyramid, chance)
+    weighed = [(c, judge.evidence(c)) for c in refine(pyramid, candidates, _NUM_REFINED)]
     # The objective counts what overlaps, so a pose that lays much on much may score above the true
     # one though the maps contradict it: evidence decides.
     weighed.sort(key=lambda pair: -pose_logit(pair[1], volume))
@@ -88,15 +87,15 @@ def weigh(
     return Found(list(refined), evidence, chance)
 
 
-def refine(levels: list[GridProblem], candidates: list[Candidate], limit: int) -> list[Candidate]:
-    """The maxima of the best candidates on the finest level, best first.
+def refine(pyramid: Pyramid, candidates: list[Candidate], limit: int) -> list[Candidate]:
+    """The maxima of the searched problem's best candidates on the finest one, best first.
 
-    All climb on the first finer level, whose scores rank them far better; ``limit`` go on.
+    All climb on the first finer problem, whose scores rank them far better; ``limit`` go on.
     """
     refined = candidates
-    for coarse, fine in itertools.pairwise(levels):
-        poses = [fine.to_pose(coarse.to_motion(c.pose)) for c in refined]
-        refined = climb(fine, np.array(poses))[:limit]
+    for coarse, fine in pyramid.steps_to_finest():
+        poses = carried(coarse, fine, np.array([c.pose for c in refined]))
+        refined = climb(fine, poses)[:limit]
     return refined[:limit]
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from uw_dslam_ros2.core.features.grid_filter import CellEvidence, clean_cells, coarsen
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grids.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.problem import GridProblem, build_problem
+from uw_dslam_ros2.core.registration.grids.problem import build_problem
+from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid
 
 __all__ = ["FINE_SIGMA_CELLS", "prepare_maps"]
 
@@ -16,11 +20,14 @@ FINE_SIGMA_CELLS = 2.0
 """Kernel of the walls on the finest level, in its cells."""
 _FINE_POINTS = 1200
 _LEAST_SIDE_CELLS = 4
+# Cells of the scan within that distance, at least: with fewer the walls' kernels run together.
+_SCANNED_PER_SPACING = 2.0
+_MOST_SCANNED, _MOST_FINEST = 4.0, 2.0  # times the cells asked for, of a map far larger
 
 
 def prepare_maps(
     source: OccupancyMap, target: OccupancyMap, config: GridRegistrationConfig
-) -> tuple[list[GridProblem], tuple[WallMap, WallMap]] | str:
+) -> tuple[Pyramid, tuple[WallMap, WallMap]] | str:
     """Problems from coarse to fine, and both maps; or what a map lacks, as a sentence."""
     resolution_m = _finest_resolution(source, target, config.finest_cells)
     sides = []
@@ -35,22 +42,37 @@ def prepare_maps(
 
 def _finest_resolution(source: OccupancyMap, target: OccupancyMap, num_cells: int) -> float:
     specs = (source.spec, target.spec)
-    longest_m = max(max(spec.shape) * spec.resolution_m for spec in specs)
     coarser = max(spec.resolution_m for spec in specs)
+    sides = sorted(max(spec.shape) * spec.resolution_m / coarser for spec in specs)
     # A whole multiple, whose sums are quick.
-    return coarser * math.ceil(longest_m / coarser / num_cells - 1e-9)
+    return coarser * _cell_size(sides, num_cells, _MOST_FINEST)
 
 
-def _levels(source: WallMap, target: WallMap, config: GridRegistrationConfig) -> list[GridProblem]:
-    """Problems from the searched lattice to the finest one."""
-    longest = max(*source.cells.shape, *target.cells.shape)
-    stride = max(1, math.ceil(longest / config.working_cells))
-    strides = [stride]
+def _cell_size(sides: Sequence[float], num_cells: int, most: float) -> int:
+    """How many cells make one, given the longer sides of the smaller and of the larger map.
+
+    As many as leave the larger map ``num_cells``; but a small map in a large one needs smaller
+    cells, or nothing is left of it: half of ``num_cells`` along itself, as long as the larger map
+    has at most ``most`` times as many.
+    """
+    smaller, larger = sides
+    size = max(min(larger, 2.0 * smaller), larger / most) / num_cells
+    return max(1, math.ceil(size - 1e-9))
+
+
+def _levels(source: WallMap, target: WallMap, config: GridRegistrationConfig) -> Pyramid:
+    """Problems whose cells are halved from those of the scan to the finest."""
+    sides = sorted(max(walls.cells.shape) for walls in (source, target))
+    num_cells = config.working_cells
+    unit = max(1, math.ceil(sides[1] / num_cells))
+    least = max(1, math.ceil(sides[1] / (_MOST_SCANNED * num_cells)))
+    detail = min(_wall_spacing(walls) for walls in (source, target))
+    stride = _cell_size(sides, num_cells, _MOST_SCANNED)
+    strides = [min(stride, max(least, int(detail / _SCANNED_PER_SPACING)))]
     while strides[-1] > 1:
-        strides.append(max(1, strides[-1] // 2))
+        strides.append((strides[-1] + 1) // 2)
     levels = []
-    for stride in strides:
-        is_search = stride == strides[0]
+    for number, stride in enumerate(strides):
         levels.append(
             build_problem(
                 source.cells,
@@ -58,11 +80,17 @@ def _levels(source: WallMap, target: WallMap, config: GridRegistrationConfig) ->
                 stride=stride,
                 sigma_cells=config.sigma_cells if stride > 1 else FINE_SIGMA_CELLS,
                 free_penalty=config.free_penalty,
-                max_points=config.max_points if is_search else _FINE_POINTS,
+                max_points=config.max_points if number < 2 else _FINE_POINTS,
                 distances=(source.distance, target.distance),
             )
         )
-    return levels
+    return Pyramid(tuple(levels), unit / strides[0])
+
+
+def _wall_spacing(walls: WallMap) -> float:
+    """How far free cells are from a wall [cells], the median; infinite without any free cell."""
+    distance = walls.distance[walls.cells.free > 0.5]
+    return float(np.median(distance)) if len(distance) else math.inf
 
 
 def _too_little(

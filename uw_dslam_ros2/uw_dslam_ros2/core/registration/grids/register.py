@@ -15,6 +15,7 @@ from uw_dslam_ros2.core.registration.grids.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.covariance import pose_covariance
+from uw_dslam_ros2.core.registration.grids.crop import crop_to_known
 from uw_dslam_ros2.core.registration.grids.evidence import Found, weigh
 from uw_dslam_ros2.core.registration.grids.frames import GridFrames
 from uw_dslam_ros2.core.registration.grids.paper import register_grids_by_points
@@ -25,6 +26,7 @@ from uw_dslam_ros2.core.registration.grids.probability import (
     probability_of,
 )
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid
 from uw_dslam_ros2.core.registration.grids.search import search_poses
 from uw_dslam_ros2.core.registration.grids.symmetry import add_twins
 from uw_dslam_ros2.core.registration.grids.verdict import Proof, decide
@@ -129,8 +131,8 @@ class _GridMatch:
         prior: PriorWindow | None,
         clock: Clock | None,
     ) -> None:
-        self._source, self._target = source, target
-        self._frames = GridFrames(source.spec, target.spec)
+        self._source, self._target = crop_to_known(source), crop_to_known(target)
+        self._frames = GridFrames(self._source.spec, self._target.spec)
         self._config, self._prior, self._clock = config, prior, clock
         self._start_s = clock() if clock is not None else math.nan
         self._is_cancelled = False
@@ -144,36 +146,42 @@ class _GridMatch:
         prepared = prepare_maps(self._source, self._target, self._config)
         if isinstance(prepared, str):
             return self._refused(Verdict.TOO_FEW_FEATURES, prepared)
-        levels, walls = prepared
-        window = self._frames.window(levels[0], self._prior)
-        candidates, chance = scan_candidates(levels[0], window)
-        found = weigh(walls, levels, window, candidates, chance)
+        pyramid, walls = prepared
+        searched = pyramid.searched
+        window = self._frames.window(pyramid.scanned, self._prior)
+        candidates, chance = scan_candidates(pyramid, window)
+        found = weigh(walls, pyramid, window, candidates, chance)
         verdict, _, _ = decide(found.evidence, self._config)
         # What the evidence refuses anyway gets a short search, which may find better.
         num_boxes = self._config.max_boxes
         if verdict is not Verdict.ACCEPTED:
             num_boxes = min(num_boxes, _NUM_BOXES_OF_REFUSED)
         outcome = self._certify(
-            levels[0], window, candidates[0].pose, num_boxes, progress, is_cancelled
+            searched,
+            self._frames.window(searched, self._prior),
+            candidates[0].pose,
+            num_boxes,
+            progress,
+            is_cancelled,
         )
         is_better = outcome.lower_bound > candidates[0].score * (1.0 + 1e-6)
         if is_better or (verdict is Verdict.ACCEPTED and not outcome.is_complete):
             # Where the proof is open, the poses that it could not exclude are rivals like others.
-            candidates = merge_best(levels[0], candidates, outcome)
-            found = weigh(walls, levels, window, candidates, chance)
-        return self._answer(levels, outcome, _with_twins(found, walls, levels, window))
+            candidates = merge_best(searched, candidates, outcome)
+            found = weigh(walls, pyramid, window, candidates, chance)
+        return self._answer(pyramid, outcome, _with_twins(found, walls, pyramid, window))
 
     def collect(self) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
         """Evidence, and that of each pose by itself; None where a map holds too little."""
         prepared = prepare_maps(self._source, self._target, self._config)
         if isinstance(prepared, str):
             return None
-        levels, walls = prepared
-        window = self._frames.window(levels[0], self._prior)
-        found = weigh(walls, levels, window, *scan_candidates(levels[0], window))
+        pyramid, walls = prepared
+        window = self._frames.window(pyramid.scanned, self._prior)
+        found = weigh(walls, pyramid, window, *scan_candidates(pyramid, window))
         weighed = (found.evidence.best, *found.evidence.rivals)
-        motions = [self._frames.to_frames(levels[-1].to_motion(c.pose)) for c in found.refined]
-        evidence = _with_twins(found, walls, levels, window).evidence
+        motions = [self._frames.to_frames(pyramid.finest.to_motion(c.pose)) for c in found.refined]
+        evidence = _with_twins(found, walls, pyramid, window).evidence
         return evidence, list(zip(weighed, motions, strict=True))
 
     def _certify(
@@ -204,9 +212,9 @@ class _GridMatch:
         return outcome
 
     def _answer(
-        self, levels: list[GridProblem], outcome: SearchOutcome, found: Found
+        self, pyramid: Pyramid, outcome: SearchOutcome, found: Found
     ) -> RegistrationResult:
-        work, finest = levels[0], levels[-1]
+        work, finest = pyramid.searched, pyramid.finest
         pose, agreement = found.refined[0].pose, found.evidence.best.agreement
         at_work = work.to_pose(finest.to_motion(pose))
         score, (_, summit) = work.value(at_work), work.ascend(at_work)
@@ -267,9 +275,9 @@ class _GridMatch:
 
 
 def _with_twins(
-    found: Found, walls: tuple[WallMap, WallMap], levels: list[GridProblem], window: PoseWindow
+    found: Found, walls: tuple[WallMap, WallMap], pyramid: Pyramid, window: PoseWindow
 ) -> Found:
     """Symmetries only matter to a match that would be convincing without them."""
     if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_TWINS:
         return found
-    return add_twins(found, walls, levels, window)
+    return add_twins(found, walls, pyramid, window)

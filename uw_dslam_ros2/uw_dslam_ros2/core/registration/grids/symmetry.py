@@ -16,12 +16,14 @@ from uw_dslam_ros2.core.registration.grids.candidates import Candidate, log_volu
 from uw_dslam_ros2.core.registration.grids.evidence import Found, Judge, is_same_pose, refine
 from uw_dslam_ros2.core.registration.grids.probability import PoseEvidence, pose_logit
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
+from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid, carried
 from uw_dslam_ros2.core.registration.grids.search import whole_plane
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["add_twins"]
 
 _NUM_SELF_MATCHES = 3
+_NUM_PEAKS = 40  # a likeness worth a doubt stands out
 _MARGIN_RAD = 0.2  # past the half turn, the likeliest symmetry of all
 _LEAST_LOGIT = 0.0  # a likeness less convincing makes no rival
 _REFUTED_SHARE = 0.8  # of the match's agreement: with less, the maps themselves say no
@@ -38,33 +40,36 @@ class _Likeness:
 def add_twins(
     found: Found,
     sides: tuple[WallMap, WallMap],
-    levels: list[GridProblem],
+    pyramid: Pyramid,
     window: PoseWindow,
 ) -> Found:
     """Evidence with the rivals that likenesses within either map make.
 
-    ``sides``, ``levels`` and ``window``, beyond which nothing is a rival, as for
+    ``sides``, ``pyramid`` and ``window``, beyond which nothing is a rival, as for
     `grid_evidence.weigh`. Where a map is laid on itself by S, a match T has the rival T S (or S T,
     on the target's side). Unless the two maps refute it, that rival is as convincing as the
     likeness, and at most as the match.
     """
-    finest, evidence = levels[-1], found.evidence
+    finest, evidence = pyramid.finest, found.evidence
     T_best = finest.to_motion(found.refined[0].pose)
     twins = []
     for is_source, walls in zip((True, False), sides, strict=True):
-        for likeness in _likenesses(walls, [_on_itself(p, is_source) for p in levels]):
+        itself = replace(
+            pyramid, problems=tuple(_on_itself(p, is_source) for p in pyramid.problems)
+        )
+        for likeness in _likenesses(walls, itself):
             for T_self in (likeness.T_self, likeness.T_self.inverse()):
                 twins.append((T_best @ T_self if is_source else T_self @ T_best, likeness))
     if not twins:
         return found
-    judge = Judge(sides, levels, found.chance)
+    judge = Judge(sides, pyramid, found.chance)
 
     def logit(pose: PoseEvidence) -> float:
         return pose_logit(pose, evidence.log_volume)
 
     refined, rivals = list(found.refined), list(evidence.rivals)
     for T_twin, likeness in twins:
-        if not window.holds(levels[0].to_pose(T_twin)):
+        if not window.holds(pyramid.scanned.to_pose(T_twin)):
             continue
         candidate = _settled(finest, T_twin)
         same = [k for k, c in enumerate(refined) if is_same_pose(finest, c.pose, candidate.pose)]
@@ -106,23 +111,29 @@ def _on_itself(problem: GridProblem, is_source: bool) -> GridProblem:
     )
 
 
-def _likenesses(walls: WallMap, levels: list[GridProblem]) -> list[_Likeness]:
+def _likenesses(walls: WallMap, pyramid: Pyramid) -> list[_Likeness]:
     """Convincing motions of a map onto itself; half of all turns, the rest are their inverses."""
-    work, finest = levels[0], levels[-1]
-    plane = whole_plane(work)
+    scanned, searched, finest = pyramid.scanned, pyramid.searched, pyramid.finest
+    plane = whole_plane(scanned)
     half_rad = 0.5 * math.pi + _MARGIN_RAD
     window = PoseWindow(
         np.array([0.5 * math.pi, *plane.middle[1:]]), np.array([half_rad, *plane.half[1:]])
     )
-    candidates, chance = scan_candidates(work, window)
-    identity = work.to_pose(SE2())
-    others = [c for c in candidates if not is_same_pose(work, c.pose, identity)]
+    candidates, chance = scan_candidates(pyramid, window, _NUM_PEAKS)
+    identity = scanned.to_pose(SE2())
+    poses = carried(searched, scanned, np.array([c.pose for c in candidates]))
+    others = [
+        candidate
+        for candidate, pose in zip(candidates, poses, strict=True)
+        if not is_same_pose(scanned, pose, identity)
+    ]
     if not others:
         return []
-    judge = Judge((walls, walls), levels, chance)
+    judge = Judge((walls, walls), pyramid, chance)
     found = []
-    for candidate in refine(levels, others, _NUM_SELF_MATCHES):
+    volume = log_volume(pyramid, plane)
+    for candidate in refine(pyramid, others, _NUM_SELF_MATCHES):
         likeness = _Likeness(finest.to_motion(candidate.pose), judge.evidence(candidate))
-        if pose_logit(likeness.evidence, log_volume(work, plane)) > _LEAST_LOGIT:
+        if pose_logit(likeness.evidence, volume) > _LEAST_LOGIT:
             found.append(likeness)
     return found

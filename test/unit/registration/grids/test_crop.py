@@ -1,0 +1,67 @@
+"""Nothing outside of what is known decides on a match: margins, canvases, specks far away."""
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.registration.grids.crop import crop_to_known
+from uw_dslam_ros2.core.registration.grids.register import register_grids
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.sim.map_pairs import make_pair
+
+
+def _on_canvas(occupancy: OccupancyMap, left: int, below: int, side: int) -> OccupancyMap:
+    """The map on a larger square of unknown cells, in the same frame."""
+    spec = occupancy.spec
+    values = np.full((side, side), -1, np.int8)
+    rows, cols = spec.shape
+    values[below : below + rows, left : left + cols] = occupancy.values
+    corner = SE2(-left * spec.resolution_m, -below * spec.resolution_m)
+    return OccupancyMap(
+        GridSpec(spec.resolution_m, side, side, spec.T_frame_grid @ corner), values
+    )
+
+
+def test_a_crop_keeps_each_known_cell_where_it_lies():
+    values = np.full((7, 9), -1, np.int8)
+    values[2, 3:6], values[4, 4] = 100, 0
+    whole = OccupancyMap(GridSpec(0.5, 7, 9, SE2(10.0, -3.0, 0.7)), values)
+    part = crop_to_known(whole)
+    assert part.spec.shape == (3, 3)
+    np.testing.assert_array_equal(part.values, [[100] * 3, [-1] * 3, [-1, 0, -1]])
+    np.testing.assert_allclose(
+        part.spec.centers_of(np.argwhere(part.known)),
+        whole.spec.centers_of(np.argwhere(whole.known)),
+    )
+    assert crop_to_known(part) is part
+
+
+def test_specks_far_away_are_cut_and_those_inside_stay():
+    values = np.full((300, 400), -1, np.int8)
+    values[100:200, 150:290] = 0
+    values[120, 170:176] = 100
+    values[5, 3], values[290:293, 380] = 100, 0
+    part = crop_to_known(OccupancyMap(GridSpec(0.1, 300, 400), values))
+    assert part.spec.shape == (100, 140)
+    assert (part.values == 100).sum() == 6
+
+
+def test_a_map_of_nothing_stays():
+    nothing = OccupancyMap(GridSpec(0.1, 20, 30), np.full((20, 30), -1, np.int8))
+    assert crop_to_known(nothing) is nothing
+
+
+@pytest.mark.parametrize("is_matching", [True, False])
+def test_a_canvas_changes_neither_verdict_nor_motion(is_matching):
+    """The lattice once lay over the canvas: with nine wall points left, any pose was certain."""
+    pair = make_pair("office", 0.5, "noisy", 7001, size_cells=160, is_matching=is_matching)
+    plain = register_grids(pair.source, pair.target)
+    large = register_grids(
+        _on_canvas(pair.source, 803, 17, 1500), _on_canvas(pair.target, 0, 1400, 1600)
+    )
+    assert (large.verdict, large.num_boxes) == (plain.verdict, plain.num_boxes)
+    assert large.probability == pytest.approx(plain.probability, abs=1e-6)
+    distance_m, angle_rad = large.T_target_source.distance_to(plain.T_target_source)
+    assert distance_m < 1e-6
+    assert angle_rad < 1e-6
+    assert plain.is_accepted == is_matching

@@ -1,0 +1,54 @@
+"""Maps without what is unknown around them, so that no canvas decides on a match."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["crop_to_known"]
+
+_LEAST_SHARE = 0.002  # of all known cells: an island with fewer is a speck
+
+
+def crop_to_known(occupancy: OccupancyMap) -> OccupancyMap:
+    """The smallest part that holds what is known, specks aside, in the same frame.
+
+    Specks inside that part stay. The map itself where nothing would be cut.
+    """
+    known = occupancy.known
+    box = _bounds(known)
+    if box is None:
+        return occupancy
+    inner = np.ascontiguousarray(known[box])
+    count, _, stats, _ = cv2.connectedComponentsWithStats(inner.view(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    large = stats[1:][areas >= _LEAST_SHARE * areas.sum()]
+    if count > 2 and 0 < len(large) < count - 1:
+        first = large[:, [cv2.CC_STAT_TOP, cv2.CC_STAT_LEFT]]
+        last = first + large[:, [cv2.CC_STAT_HEIGHT, cv2.CC_STAT_WIDTH]]
+        row, col = (int(v) for v in first.min(axis=0))
+        end_row, end_col = (int(v) for v in last.max(axis=0))
+        box = (
+            slice(box[0].start + row, box[0].start + end_row),
+            slice(box[1].start + col, box[1].start + end_col),
+        )
+    values = occupancy.values[box]
+    if values.shape == occupancy.spec.shape:
+        return occupancy
+    spec = occupancy.spec
+    corner = SE2(box[1].start * spec.resolution_m, box[0].start * spec.resolution_m)
+    num_rows, num_cols = values.shape
+    part = GridSpec(spec.resolution_m, num_rows, num_cols, spec.T_frame_grid @ corner)
+    return OccupancyMap(part, np.ascontiguousarray(values))
+
+
+def _bounds(mask: NDArray[np.bool_]) -> tuple[slice, slice] | None:
+    """Rows and columns that hold all set cells; None without any."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return None
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
