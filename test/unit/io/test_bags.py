@@ -54,9 +54,10 @@ def test_events_are_what_was_written(tmp_path, storage):
     np.testing.assert_allclose(image.image.range_m, [1.0, 1.5, 2.0, 2.5, 3.0])
     assert (imu.yaw_rad, imu.yaw_variance) == pytest.approx((0.5, 0.01))
     assert imu.yaw_rate_rad_s == -0.25
-    np.testing.assert_allclose(dvl.velocity_m_s, [1.0, 0.25])
-    np.testing.assert_allclose(dvl.covariance, 1e-4 * np.eye(2))
-    np.testing.assert_allclose(twist.velocity_m_s, [1.0, 0.25])
+    np.testing.assert_allclose(dvl.velocity_m_s, [1.0, -0.25, 0.0])  # y to starboard
+    np.testing.assert_allclose(dvl.horizontal()[0], [1.0, 0.25])
+    np.testing.assert_allclose(dvl.horizontal()[1], 1e-4 * np.eye(2))
+    np.testing.assert_allclose(twist.horizontal()[0], [1.0, 0.25])
     assert depth.depth_m == pytest.approx(2.5)
     np.testing.assert_allclose(points.points, [[1.0, -2.0], [3.5, 4.25]])
     assert truth.T_world_base.as_array() == pytest.approx([1.0, 2.0, 3.0])

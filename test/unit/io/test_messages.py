@@ -10,6 +10,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.io import messages
 from uw_dslam_ros2.io.interfaces import make_typestore
 from uw_dslam_ros2.io.outgoing import MessageFactory
+from uw_dslam_ros2.io.readings import FixEvent, ImuEvent, VelocityEvent
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +70,8 @@ def test_dvl_frame_has_starboard_y(make):
     assert (msg.velocity.x, msg.velocity.y) == (1.0, -0.25)
     msg.velocity_covar[1] = msg.velocity_covar[3] = 2e-5
     velocity, covariance = messages.velocity_of_dvl(msg)
+    event = VelocityEvent("auv_1", 0, "dvl", velocity, covariance, is_z_down=True)
+    velocity, covariance = event.horizontal()
     assert velocity.tolist() == [1.0, 0.25]
     np.testing.assert_allclose(covariance, [[1e-4, -2e-5], [-2e-5, 1e-4]])
 
@@ -85,16 +88,19 @@ def test_dvl_without_velocity_over_ground(make):
 
 def test_imu_says_what_it_lacks(make):
     msg = make.imu(0, "imu", 2.5, 0.01, 0.5, 1e-6)
-    assert messages.yaw_of_imu(msg) == pytest.approx((2.5, 0.01, 0.5))
+    orientation, variance, rates = messages.readings_of_imu(msg)
+    assert (variance, rates.tolist()) == (pytest.approx(0.01), [0.0, 0.0, 0.5])
+    event = ImuEvent("auv_1", 0, "imu", orientation, variance, rates)
+    assert (event.yaw_rad, event.yaw_rate_rad_s) == pytest.approx((2.5, 0.5))
     no_orientation = make.imu(0, "imu", None, 0.01, 0.5, 1e-6)
-    assert messages.yaw_of_imu(no_orientation) == (None, None, 0.5)
+    assert messages.readings_of_imu(no_orientation)[:2] == (None, None)
     no_rate = make.imu(0, "imu", 2.5, 0.01, None, 1e-6)
-    assert messages.yaw_of_imu(no_rate)[2] is None
+    assert messages.readings_of_imu(no_rate)[2] is None
     zero = replace(msg, orientation=make.quaternion((0, 0, 0, 0)))
-    assert messages.yaw_of_imu(zero)[0] is None
+    assert messages.readings_of_imu(zero)[0] is None
     bad = replace(msg, orientation=make.quaternion((0, 0, 0, 2)))
     with pytest.raises(InvalidInputError, match="quaternion"):
-        messages.yaw_of_imu(bad)
+        messages.readings_of_imu(bad)
 
 
 def test_depth_of_ten_metres_of_sea_water():
@@ -134,3 +140,11 @@ def test_cloud_with_padding_and_nan(make):
 
 def test_empty_cloud(make):
     assert messages.points_of_cloud(make.points(0, "sonar", np.empty((0, 2)))).shape == (0, 2)
+
+
+def test_a_satellite_fix_becomes_metres_east_and_north():
+    # One arc second of latitude is 30.9 m, one of longitude 30.9 m times cos(60 degrees).
+    fix = FixEvent("auv_1", 0, "gps", np.array([60.0, 10.0]) + 1.0 / 3600.0, None, True)
+    np.testing.assert_allclose(fix.position_m((60.0, 10.0)), [15.5, 30.95], atol=0.05)
+    acoustic = FixEvent("auv_1", 0, "map", np.array([3.0, 4.0]), None)
+    assert acoustic.position_m((60.0, 10.0)).tolist() == [3.0, 4.0]

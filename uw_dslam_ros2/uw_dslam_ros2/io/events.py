@@ -168,12 +168,12 @@ class _Context:
         return ImageEvent(*key, messages.sonar_image_of(msg, self._data_order))
 
     def _imu(self, key: _Key, msg: Any) -> Event:
-        return ImuEvent(*key, *messages.yaw_of_imu(msg))
+        return ImuEvent(*key, *messages.readings_of_imu(msg))
 
     def _velocity(self, key: _Key, msg: Any) -> Event | None:
         is_dvl = hasattr(msg, "velocity_mode")
         value = messages.velocity_of_dvl(msg) if is_dvl else messages.velocity_of_twist(msg)
-        return None if value is None else VelocityEvent(*key, *value)
+        return None if value is None else VelocityEvent(*key, *value, is_z_down=is_dvl)
 
     def _depth(self, key: _Key, msg: Any) -> Event:
         return DepthEvent(*key, messages.depth_of_pressure(msg, self._water_density_kg_m3))

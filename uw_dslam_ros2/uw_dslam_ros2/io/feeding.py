@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.mapping import VehicleMapper
 from uw_dslam_ros2.core.mounting import planar_mount
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.io.events import (
+from uw_dslam_ros2.io.readings import (
     DepthEvent,
     ImageEvent,
     ImuEvent,
     PointsEvent,
+    Reading,
     ScanEvent,
     VelocityEvent,
 )
 
 __all__ = ["SensorEvent", "feed", "in_stamp_order"]
 
-SensorEvent = ImageEvent | ImuEvent | VelocityEvent | DepthEvent | ScanEvent | PointsEvent
+SensorEvent = Reading
 
 _PINGS = (ImageEvent, ScanEvent, PointsEvent)
 _HOLD_NS = 2_000_000_000
@@ -71,7 +72,7 @@ def feed(
             return mapper.add_points(stamp_ns, event.points, planar_mount(T_base_sensor))
         case VelocityEvent():
             mount = planar_mount(T_base_sensor)
-            mapper.add_velocity(stamp_ns, event.velocity_m_s, event.covariance, mount)
+            mapper.add_velocity(stamp_ns, *event.horizontal(), mount)
         case ImuEvent():
             _feed_imu(mapper, event, planar_mount(T_base_sensor).yaw)
         case DepthEvent():

@@ -24,12 +24,12 @@ __all__ = [
     "matrix_of_transform",
     "points_of_cloud",
     "pose_of_odometry",
+    "readings_of_imu",
     "scan_of_laser_scan",
     "sonar_image_of",
     "stamp_of",
     "velocity_of_dvl",
     "velocity_of_twist",
-    "yaw_of_imu",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -106,63 +106,61 @@ def _as_buffer(data: Any) -> Any:
     return bytes(data) if isinstance(data, list) else data
 
 
-def yaw_of_imu(msg: Any) -> tuple[float | None, float | None, float | None]:
-    """``(yaw [rad], its variance [rad^2], yaw rate [rad/s])`` of a ``sensor_msgs/Imu``, or None.
+def readings_of_imu(msg: Any) -> tuple[FloatArray | None, float | None, FloatArray | None]:
+    """``(quaternion, variance of yaw [rad^2], rates (3,) [rad/s])`` of an Imu, or None.
 
     The message says "no orientation" and "no rates" by -1 in the first element of the covariance;
     an all-zero quaternion is taken for the same. A variance of 0 means unknown.
     """
     q = msg.orientation
-    yaw: float | None = None
+    orientation: FloatArray | None = None
     variance: float | None = None
     if float(msg.orientation_covariance[0]) != -1.0 and any((q.x, q.y, q.z, q.w)):
-        rotation = rotation_of_quaternion((q.x, q.y, q.z, q.w))
-        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+        orientation = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
+        rotation_of_quaternion(orientation)  # refuses what is no rotation
         value = float(msg.orientation_covariance[8])
         variance = value if value > 0.0 else None
-    rate = float(msg.angular_velocity.z)
-    has_rate = float(msg.angular_velocity_covariance[0]) != -1.0
-    if has_rate and not math.isfinite(rate):
-        raise InvalidInputError(f"angular_velocity.z is {rate}, expected a finite number")
-    return yaw, variance, rate if has_rate else None
+    turning = msg.angular_velocity
+    rates = np.array([turning.x, turning.y, turning.z], dtype=np.float64)
+    has_rates = float(msg.angular_velocity_covariance[0]) != -1.0
+    if has_rates and not math.isfinite(rates[2]):
+        raise InvalidInputError(f"angular_velocity.z is {rates[2]}, expected a finite number")
+    return orientation, variance, rates if has_rates else None
 
 
 def velocity_of_dvl(msg: Any) -> tuple[FloatArray, FloatArray | None] | None:
-    """Velocity (2,) [m/s] and covariance (2, 2) or None of a ``marine_acoustic_msgs/Dvl``, FLU.
+    """Velocity (3,) [m/s] and covariance (3, 3) or None of a ``marine_acoustic_msgs/Dvl``.
 
-    The instrument's frame is x forward, z down, so its y is starboard and changes sign. None
-    without a velocity over ground: bottom lock lost, fewer than three good beams, or measured
-    against the water.
+    In the instrument's frame, x forward, z down. None without a velocity over ground: bottom lock
+    lost, fewer than three good beams, or measured against the water.
     """
-    velocity = np.array([msg.velocity.x, -msg.velocity.y], dtype=np.float64)
+    velocity = np.array([msg.velocity.x, msg.velocity.y, msg.velocity.z], dtype=np.float64)
     num_beams = int(msg.num_good_beams)
     # Some drivers leave the count at 0; then only a velocity that is exactly 0 means "none".
-    is_counted_out = 0 < num_beams < _MIN_DVL_BEAMS or (num_beams == 0 and not velocity.any())
+    is_counted_out = 0 < num_beams < _MIN_DVL_BEAMS or (num_beams == 0 and not velocity[:2].any())
     if (
         int(msg.velocity_mode) == _DVL_MODE_WATER
         or is_counted_out
-        or not np.isfinite(velocity).all()
+        or not np.isfinite(velocity[:2]).all()
     ):
         return None
-    covariance = np.asarray(msg.velocity_covar, dtype=np.float64).reshape(3, 3)[:2, :2].copy()
-    covariance[0, 1] *= -1.0
-    covariance[1, 0] *= -1.0
-    return velocity, _covariance_or_none(covariance)
+    covariance = np.asarray(msg.velocity_covar, dtype=np.float64).reshape(3, 3)
+    return np.nan_to_num(velocity), _covariance_or_none(covariance)
 
 
 def velocity_of_twist(msg: Any) -> tuple[FloatArray, FloatArray | None]:
-    """Velocity (2,) [m/s] and covariance of a ``TwistWithCovarianceStamped``, in its FLU frame."""
+    """Velocity (3,) [m/s] and covariance of a ``TwistWithCovarianceStamped``, in its FLU frame."""
     linear = msg.twist.twist.linear
-    velocity = np.array([linear.x, linear.y], dtype=np.float64)
+    velocity = np.array([linear.x, linear.y, linear.z], dtype=np.float64)
     if not np.isfinite(velocity).all():
         raise InvalidInputError(f"twist.linear is {velocity.tolist()}, expected finite numbers")
-    covariance = np.asarray(msg.twist.covariance, dtype=np.float64).reshape(6, 6)[:2, :2].copy()
+    covariance = np.asarray(msg.twist.covariance, dtype=np.float64).reshape(6, 6)[:3, :3]
     return velocity, _covariance_or_none(covariance)
 
 
 def _covariance_or_none(covariance: FloatArray) -> FloatArray | None:
-    is_usable = np.isfinite(covariance).all() and (np.diag(covariance) > 0.0).all()
-    return covariance if is_usable else None
+    is_usable = np.isfinite(covariance).all() and (np.diag(covariance)[:2] > 0.0).all()
+    return covariance.copy() if is_usable else None
 
 
 def depth_of_pressure(msg: Any, water_density_kg_m3: float = 1025.0) -> float:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.mounting import ForwardAxis, rotation_of_quaternion
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import SonarImage
 
 __all__ = [
+    "BeamsEvent",
     "DepthEvent",
     "Event",
+    "FixEvent",
     "ImageEvent",
     "ImuEvent",
     "PointsEvent",
+    "PoseEvent",
+    "Reading",
     "ScanEvent",
     "TransformEvent",
     "TruthEvent",
@@ -27,32 +33,56 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageEvent:
-    """A ping of an imaging sonar."""
+    """A ping of an imaging sonar.
+
+    ``forward`` is the axis of its frame along bearing 0. With "z" the frame is x up, y to
+    starboard (a beam is [0, -sin b, cos b]); with "x" it is y to port, z up ([cos b, sin b, 0]).
+    None: the driver does not say; then it is the one of the two that is mounted more level.
+    """
 
     vehicle_id: str
     stamp_ns: int
     frame_id: str
     image: SonarImage
+    forward: ForwardAxis | None = "z"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ImuEvent:
-    """Heading (ENU yaw of the IMU's x axis) and yaw rate; None where the message has none."""
+    """Orientation [x, y, z, w] of the IMU's frame in the world, and rates (3,) in its own frame.
+
+    None where the message has none; ``yaw_variance`` [rad^2] is None where it is unknown.
+    """
 
     vehicle_id: str
     stamp_ns: int
     frame_id: str
-    yaw_rad: float | None
+    orientation_xyzw: FloatArray | None
     yaw_variance: float | None
-    yaw_rate_rad_s: float | None
+    angular_velocity_rad_s: FloatArray | None
+
+    @property
+    def yaw_rad(self) -> float | None:
+        """Yaw of the IMU's x axis in the world as the message has it; None without orientation."""
+        if self.orientation_xyzw is None:
+            return None
+        rotation = rotation_of_quaternion(self.orientation_xyzw)
+        return math.atan2(rotation[1, 0], rotation[0, 0])
+
+    @property
+    def yaw_rate_rad_s(self) -> float | None:
+        """Rate about the IMU's own z axis; None without rates."""
+        rates = self.angular_velocity_rad_s
+        return None if rates is None else float(rates[2])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VelocityEvent:
-    """Velocity over ground (2,) [m/s] in horizontal FLU axes; covariance (2, 2) or None.
+    """Velocity over ground (3,) [m/s] in the instrument's own frame; covariance (3, 3) or None.
 
-    A DVL's own frame has z down: its y is already turned to port here. ``planar_mount`` of the
-    instrument's frame (x forward) brings it to base_link.
+    ``is_z_down`` is what the message's definition says of that frame (x forward, y to starboard, z
+    down, as a DVL has it; else y to port, z up), for where no transform says it. A component that
+    the instrument does not measure is 0.
     """
 
     vehicle_id: str
@@ -60,6 +90,15 @@ class VelocityEvent:
     frame_id: str
     velocity_m_s: FloatArray
     covariance: FloatArray | None
+    is_z_down: bool = False
+
+    def horizontal(self) -> tuple[FloatArray, FloatArray | None]:
+        """Velocity (2,) and covariance (2, 2) with x forward, y to port, by the definition."""
+        to_port = np.array([1.0, -1.0 if self.is_z_down else 1.0])
+        velocity = self.velocity_m_s[:2] * to_port
+        if self.covariance is None:
+            return velocity, None
+        return velocity, self.covariance[:2, :2] * np.outer(to_port, to_port)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +113,10 @@ class DepthEvent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanEvent:
-    """Ranges (N,) [m] at angles (N,) [rad], counter-clockwise from the frame's x axis."""
+    """Ranges (N,) [m] at angles (N,) [rad], counter-clockwise from the frame's x axis.
+
+    All of one moment: a sonar that turns while it measures makes `BeamsEvent`.
+    """
 
     vehicle_id: str
     stamp_ns: int
@@ -92,6 +134,71 @@ class PointsEvent:
     stamp_ns: int
     frame_id: str
     points: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeamsEvent:
+    """Beams of a sonar that turns, each with its own time: one, a sector or a turn.
+
+    ``beam_stamp_ns`` (B,) and ``bearing_rad`` (B,), counter-clockwise from the frame's x axis, in
+    the order of time. Without ``intensity``, ``range_m`` (B,) is each beam's echo (inf: none up to
+    ``range_max_m``). With ``intensity`` (R, B), ``range_m`` (R,) are the centres of its bins.
+    ``stamp_ns`` is the first beam's.
+    """
+
+    vehicle_id: str
+    stamp_ns: int
+    frame_id: str
+    beam_stamp_ns: NDArray[np.int64]
+    bearing_rad: FloatArray
+    range_m: FloatArray
+    range_max_m: float
+    intensity: NDArray[np.generic] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEvent:
+    """Where the vehicle's own filter believes that it is, in a frame that drifts.
+
+    ``covariance`` (3, 3) of x, y, yaw or None; ``velocity_m_s`` (3,) over ground in
+    ``child_frame_id`` or None.
+    """
+
+    vehicle_id: str
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    T_frame_base: SE2
+    covariance: FloatArray | None
+    velocity_m_s: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FixEvent:
+    """An absolute position, of an acoustic or a satellite receiver.
+
+    ``position`` (2,) is [x, y] in metres in ``frame_id``, or [latitude, longitude] in degrees
+    when ``is_geodetic``. ``covariance`` (2, 2) [m^2] of [x, y] (east, north), or None.
+    """
+
+    vehicle_id: str
+    stamp_ns: int
+    frame_id: str
+    position: FloatArray
+    covariance: FloatArray | None
+    is_geodetic: bool = False
+
+    def position_m(self, origin_deg: tuple[float, float]) -> FloatArray:
+        """[x, y]; of latitude and longitude, metres east and north of an origin nearby."""
+        if not self.is_geodetic:
+            return self.position
+        # Radii of curvature of WGS 84 at the origin; to 1 mm within a kilometre.
+        latitude = math.radians(origin_deg[0])
+        axis_m, eccentricity_squared = 6378137.0, 6.69437999014e-3
+        root = math.sqrt(1.0 - eccentricity_squared * math.sin(latitude) ** 2)
+        north_rad, east_rad = np.radians(self.position - np.asarray(origin_deg))
+        radius_m = axis_m * (1.0 - eccentricity_squared) / root**3
+        return np.array([east_rad * axis_m / root * math.cos(latitude), north_rad * radius_m])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,13 +222,17 @@ class TruthEvent:
     T_world_base: SE2
 
 
-Event = (
+Reading = (
     ImageEvent
-    | ImuEvent
-    | VelocityEvent
-    | DepthEvent
     | ScanEvent
     | PointsEvent
-    | TransformEvent
-    | TruthEvent
+    | BeamsEvent
+    | VelocityEvent
+    | ImuEvent
+    | DepthEvent
+    | PoseEvent
+    | FixEvent
 )
+"""What an instrument's message becomes."""
+
+Event = Reading | TransformEvent | TruthEvent

@@ -20,13 +20,13 @@ from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io import messages
-from uw_dslam_ros2.io.events import (
+from uw_dslam_ros2.io.feeding import SensorEvent, feed
+from uw_dslam_ros2.io.readings import (
     DepthEvent,
     ImageEvent,
     PointsEvent,
     ScanEvent,
 )
-from uw_dslam_ros2.io.feeding import SensorEvent, feed
 from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_to_msg,
     path_to_msg,

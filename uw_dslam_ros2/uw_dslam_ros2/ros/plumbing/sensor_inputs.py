@@ -11,7 +11,8 @@ from marine_acoustic_msgs.msg import Dvl, ProjectedSonarImage
 from sensor_msgs.msg import FluidPressure, Imu, LaserScan, PointCloud2
 
 from uw_dslam_ros2.io import messages
-from uw_dslam_ros2.io.events import (
+from uw_dslam_ros2.io.feeding import SensorEvent
+from uw_dslam_ros2.io.readings import (
     DepthEvent,
     ImageEvent,
     ImuEvent,
@@ -19,7 +20,6 @@ from uw_dslam_ros2.io.events import (
     ScanEvent,
     VelocityEvent,
 )
-from uw_dslam_ros2.io.feeding import SensorEvent
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 
 __all__ = ["SensorInput", "sensor_inputs"]
@@ -82,7 +82,7 @@ class _Reader:
 
     def imu(self, msg: Any) -> SensorEvent:
         """Yaw and yaw rate."""
-        return ImuEvent(*self._key(msg), *messages.yaw_of_imu(msg))
+        return ImuEvent(*self._key(msg), *messages.readings_of_imu(msg))
 
     def depth(self, msg: Any) -> SensorEvent:
         """Pressure as depth."""
@@ -93,4 +93,6 @@ class _Reader:
         """Velocity over ground; None without bottom lock."""
         is_dvl = self._config.velocity == "dvl"
         value = messages.velocity_of_dvl(msg) if is_dvl else messages.velocity_of_twist(msg)
-        return None if value is None else VelocityEvent(*self._key(msg), *value)
+        if value is None:
+            return None
+        return VelocityEvent(*self._key(msg), *value, is_z_down=is_dvl)
