@@ -1,5 +1,12 @@
+import math
+import shutil
+import sqlite3
+
 import numpy as np
 import pytest
+from backports import zstd
+from rosbags import rosbag1
+from rosbags.typesys import Stores, get_typestore
 from unit.io.bag_messages import SECOND, write_vehicle
 
 from uw_dslam_ros2.core.errors import DataError
@@ -116,9 +123,80 @@ def test_missing_file(tmp_path):
         list(read_events(tmp_path / "nowhere"))
 
 
-def test_folder_without_metadata(tmp_path):
-    with pytest.raises(DataError, match=r"no metadata\.yaml"):
+def test_folder_without_a_recording(tmp_path):
+    with pytest.raises(DataError, match=r"holds no recording; expected a rosbag2 folder"):
         list(read_events(tmp_path))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_folder_without_metadata(tmp_path, storage):
+    bag = write_bag(tmp_path / "bag", storage)
+    whole = [type(event) for event in read_events(bag)]
+    (bag / "metadata.yaml").unlink()
+    assert [type(event) for event in read_events(bag)] == whole
+    with open_bag(bag) as reader:
+        assert reader.damage == ""
+
+
+def test_a_split_recording_is_read_in_order(tmp_path):
+    folder = tmp_path / "split"
+    folder.mkdir()
+    for number, first_s in ((0, 10), (1, 30), (2, 50), (10, 70)):
+        part = write_bag(tmp_path / f"part{number}", first_s=first_s)
+        storage_file(part).rename(folder / f"split_{number}.mcap")
+    stamps = [e.stamp_ns for e in read_events(folder) if isinstance(e, ImuEvent)]
+    assert stamps == [first_s * SECOND for first_s in (11, 31, 51, 71)]
+
+
+def test_what_lies_in_the_write_ahead_log_is_read_and_left_alone(tmp_path):
+    bag = write_bag(tmp_path / "bag", "sqlite3")
+    file, folder = storage_file(bag), tmp_path / "live"
+    folder.mkdir()
+    with sqlite3.connect(file) as connection:
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("UPDATE messages SET timestamp = timestamp + 1")
+        connection.commit()
+        # As a recorder leaves it that was killed: the last pages are in the log only.
+        for name in (file.name, f"{file.name}-wal"):
+            shutil.copy(bag / name, folder / name)
+    connection.close()
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    with open_bag(folder) as reader:
+        assert len(list(reader.raw())) == 9
+        assert reader.start_ns == 10 * SECOND + 1
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+
+
+def test_compressed_files_are_read(tmp_path):
+    bag = write_bag(tmp_path / "bag", "sqlite3")
+    whole = len(list(read_events(bag)))
+    file = storage_file(bag)
+    (tmp_path / "packed").mkdir()
+    packed = tmp_path / "packed" / f"{file.name}.zstd"
+    packed.write_bytes(zstd.compress(file.read_bytes()))
+    assert len(list(read_events(tmp_path / "packed"))) == whole
+
+
+def test_a_ros_1_bag_reads_like_any_other(tmp_path):
+    """Headers of ROS 1 have a sequence number, which must not shift what follows it."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    types = store.types
+    vector = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.25)
+    with rosbag1.Writer(tmp_path / "old.bag") as writer:
+        connection = writer.add_connection("/auv_1/imu", "sensor_msgs/msg/Imu", typestore=store)
+        for number in range(3):
+            stamp = types["builtin_interfaces/msg/Time"](10 + number, 7)
+            message = types["sensor_msgs/msg/Imu"](
+                types["std_msgs/msg/Header"](number, stamp, "auv_1/imu"),
+                types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(0.2), math.cos(0.2)),
+                np.zeros(9), vector, np.zeros(9), vector, np.zeros(9),
+            )  # fmt: skip
+            data = store.serialize_ros1(message, "sensor_msgs/msg/Imu")
+            writer.write(connection, (20 + number) * SECOND, data)
+    events = list(read_events(tmp_path / "old.bag"))
+    assert [e.stamp_ns for e in events] == [s * SECOND + 7 for s in (10, 11, 12)]
+    assert events[0].yaw_rad == pytest.approx(0.4)
+    assert (events[0].frame_id, events[0].yaw_rate_rad_s) == ("auv_1/imu", 0.25)
 
 
 def test_file_of_another_format(tmp_path):
@@ -129,14 +207,34 @@ def test_file_of_another_format(tmp_path):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("keep", [0.0, 0.02, 0.3, 0.6, 0.9, 0.999])
-def test_truncated_bag(tmp_path, storage, keep):
-    bag = write_bag(tmp_path / "bag", storage)
+def test_of_a_truncated_bag_what_is_readable_is_read(tmp_path, storage, keep):
+    bag = tmp_path / "bag"
+    num_imu = 20_000  # several pages, and several chunks
+    with BagWriter(bag, storage) as writer:
+        make = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
+        for number in range(num_imu):
+            stamp_ns = SECOND + number
+            writer.write("/auv_1/imu", stamp_ns, make.imu(stamp_ns, "i", 0.1, 1e-4, 0.0, 1e-4))
     path = storage_file(bag)
     content = path.read_bytes()
     path.write_bytes(content[: int(keep * len(content))])
     for target in (bag, path):
-        with pytest.raises(DataError, match=f"{path.name if target is path else 'bag'}.* is"):
-            list(read_events(target))
+        # A database's pages are found through others, which may lie behind the cut.
+        if keep < (0.5 if storage == "sqlite3" else 0.1):
+            with pytest.raises(DataError, match=f"{target.name} is damaged"):
+                list(read_events(target))
+            continue
+        with open_bag(target) as reader:
+            stamps = [raw.stamp_ns for raw in reader.raw()]
+            if len(stamps) == num_imu and target is bag:  # only the index is missing
+                assert reader.damage == ""
+            else:
+                words = "are missing" if target is bag else "its end is missing"
+                assert words in reader.damage
+        assert stamps == sorted(set(stamps) & set(range(SECOND, SECOND + num_imu)))
+        # Where the messages end and the index begins differs.
+        assert 0.5 * keep * num_imu <= len(stamps) <= num_imu
 
 
 def test_empty_bag(tmp_path):

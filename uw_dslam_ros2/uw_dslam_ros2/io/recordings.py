@@ -1,11 +1,8 @@
-"""Bags as files: rosbag2 recordings (MCAP, sqlite3), message by message."""
+"""Bags as files: rosbag2 and ROS 1 recordings, message by message."""
 
 from __future__ import annotations
 
 import heapq
-import sqlite3
-import struct
-import zlib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -13,7 +10,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import apsw
 from rosbags.interfaces import (
     Connection,
     MessageDefinitionFormat,
@@ -27,8 +23,6 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import (
     CompressionFormat,
     CompressionMode,
-    Reader,
-    ReaderError,
     StoragePlugin,
     Writer,
     WriterError,
@@ -45,23 +39,10 @@ from rosbags.typesys.store import Typestore
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.io.interfaces import make_typestore
+from uw_dslam_ros2.io.storages import BROKEN, Ros1Storage, Storage, open_storages, uncompressed
 
 __all__ = ["BagReader", "BagWriter", "Message", "RawMessage", "open_bag", "open_bags"]
 
-# What reading a broken file was seen to raise, beside the library's own error.
-_BROKEN = (
-    ReaderError,
-    sqlite3.Error,
-    apsw.Error,
-    struct.error,
-    zlib.error,
-    EOFError,
-    ValueError,
-    TypeError,
-    IndexError,
-    KeyError,
-    MemoryError,
-)
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _IDL_SEPARATOR = "=" * 80 + "\n"
 
@@ -87,25 +68,34 @@ class Message:
 
 
 class BagReader:
-    """An open recording; made by `open_bag`."""
+    """An open recording; made by `open_bag`.
 
-    def __init__(self, path: Path, reader: Reader) -> None:
+    ``damage`` says what is missing of it, "" where it is whole.
+    """
+
+    def __init__(self, path: Path, storages: Sequence[Storage], damage: str = "") -> None:
         self.path = path
-        self._reader = reader
-        self._typestore: Typestore | None = None
+        self.damage = damage
+        self._storages = storages
+        self._typestores: dict[str, Typestore] = {}
         self.topics: dict[str, str] = {}
-        for connection in reader.connections:
+        self.message_counts: dict[str, int] = {}
+        for connection in self._connections():
             known = self.topics.setdefault(connection.topic, connection.msgtype)
             if known != connection.msgtype:
                 raise DataError(
                     f"{path}: topic {connection.topic} has two types, "
                     f"{known} and {connection.msgtype}"
                 )
-        self.message_counts: dict[str, int] = dict.fromkeys(self.topics, 0)
-        for connection in reader.connections:
-            self.message_counts[connection.topic] += connection.msgcount
-        self.start_ns = reader.start_time
-        self.end_ns = reader.end_time - 1
+            count = self.message_counts.get(connection.topic, 0)
+            self.message_counts[connection.topic] = count + connection.msgcount
+        filled = [storage for storage in storages if storage.message_count]
+        self.start_ns = min(storage.start_time for storage in filled)
+        self.end_ns = max(storage.end_time for storage in filled) - 1
+
+    def _connections(self) -> Iterator[Connection]:
+        for storage in self._storages:
+            yield from storage.connections
 
     def raw(
         self,
@@ -125,12 +115,17 @@ class BagReader:
                 raise DataError(
                     f"{self.path}: no topic {topic}; there are {', '.join(sorted(self.topics))}"
                 )
-        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
-        if not wanted:
-            return
+        streams = []
+        for storage in self._storages:
+            wanted = [c for c in storage.connections if topics is None or c.topic in topics]
+            if wanted:
+                streams.append(storage.messages(wanted, start_ns, stop_ns))
+        ordered = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda m: m[1])
         with _explained(self.path):
-            for connection, stamp_ns, data in self._reader.messages(wanted, start_ns, stop_ns):
-                yield RawMessage(connection.topic, connection.msgtype, stamp_ns, data)
+            for connection, stamp_ns, data in ordered:
+                yield RawMessage(
+                    connection.topic, connection.msgtype, stamp_ns, uncompressed(data)
+                )
 
     def messages(
         self,
@@ -144,15 +139,25 @@ class BagReader:
 
     def deserialize(self, raw: RawMessage) -> Any:
         """Content of a message of this bag, after the definitions that the bag itself carries."""
-        if self._typestore is None:
-            self._typestore = _typestore_of(self.path, self._reader.connections)
+        if raw.msgtype not in self._typestores:
+            self._typestores[raw.msgtype] = self._typestore_of(raw.msgtype)
         try:
-            return self._typestore.deserialize_cdr(raw.data, raw.msgtype)
-        except (SerdeError, TypesysError, KeyError, *_BROKEN) as error:
+            return self._typestores[raw.msgtype].deserialize_cdr(raw.data, raw.msgtype)
+        except (SerdeError, TypesysError, KeyError, *BROKEN) as error:
             raise DataError(
                 f"{self.path}: a message on {raw.topic} at {raw.stamp_ns} ns does not fit "
                 f"its type {raw.msgtype}: {error or type(error).__name__}"
             ) from error
+
+    def _typestore_of(self, msgtype: str) -> Typestore:
+        """Types that one topic's messages need; those of other topics may be unknown."""
+        for storage in self._storages:
+            for connection in storage.connections:
+                if connection.msgtype == msgtype:
+                    if isinstance(storage, Ros1Storage):
+                        return storage.store_of(connection)
+                    return _typestore_of(self.path, connection)
+        raise DataError(f"{self.path}: no topic has type {msgtype}")
 
 
 @contextmanager
@@ -161,56 +166,31 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except DataError:
         raise
-    except _BROKEN as error:
+    except BROKEN as error:
         raise DataError(
             f"{path} is damaged, truncated, or was not closed by its recorder "
-            f"({error or type(error).__name__}); expected a complete rosbag2 recording"
+            f"({error or type(error).__name__}); expected a complete recording"
         ) from error
 
 
 @contextmanager
 def open_bag(path: str | Path) -> Iterator[BagReader]:
-    """Open a rosbag2 folder, or a single ``.mcap`` or ``.db3`` file, for reading.
+    """Open a recording: a rosbag2 folder, an ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
+
+    Split and compressed recordings, those without metadata.yaml and those that were cut off are
+    read as far as they can be; `BagReader.damage` tells of it.
 
     Raises
     ------
     DataError
-        If the file is missing, of another format, truncated, or holds no messages.
+        If the file is missing, of another format, unreadable, or holds no messages.
     """
     path = Path(path)
-    if not path.exists():
-        raise DataError(
-            f"{path} does not exist; expected a rosbag2 folder, or an .mcap or .db3 file"
-        )
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        raise DataError(f"{path} has no metadata.yaml; expected a closed rosbag2 recording")
-    if path.is_file() and path.suffix not in (".mcap", ".db3"):
-        raise DataError(
-            f"{path} is not a bag; expected a rosbag2 folder, or an .mcap or .db3 file"
-        )
     with ExitStack() as stack:
-        with _explained(path):
-            _check_database_sizes(path)
-            reader = stack.enter_context(Reader(path))
-        if reader.message_count == 0:
+        storages, damage = open_storages(path, stack)
+        if not sum(storage.message_count for storage in storages):
             raise DataError(f"{path} is empty; expected a recording with at least one message")
-        yield BagReader(path, reader)
-
-
-def _check_database_sizes(path: Path) -> None:
-    """Sqlite itself notices missing pages only when a query happens to need them."""
-    for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
-        if file.suffix != ".db3":
-            continue
-        with file.open("rb") as stream:
-            header = stream.read(100)
-        if len(header) < 100:
-            raise ReaderError(f"{file.name} has no database header")
-        page_size, num_pages = struct.unpack(">16xH10xI", header[:32])
-        # A page size of 1 stands for 65536.
-        expected = (65536 if page_size == 1 else page_size) * num_pages
-        if (size := file.stat().st_size) < expected:
-            raise ReaderError(f"{file.name} has {size} of {expected} bytes")
+        yield BagReader(path, storages, damage)
 
 
 @contextmanager
@@ -222,31 +202,29 @@ def open_bags(paths: Sequence[str | Path]) -> Iterator[list[BagReader]]:
         yield [stack.enter_context(open_bag(path)) for path in paths]
 
 
-def _typestore_of(path: Path, connections: Sequence[Connection]) -> Typestore:
-    """Types as the bag defines them; those without a definition as we know them."""
-    own = make_typestore()
+def _typestore_of(path: Path, connection: Connection) -> Typestore:
+    """Types as the bag defines them; one without a definition as we know it."""
     store = get_typestore(Stores.EMPTY)
-    for connection in connections:
-        definition = connection.msgdef
-        try:
-            if definition.format == MessageDefinitionFormat.MSG:
-                types = get_types_from_msg(definition.data, connection.msgtype)
-            elif definition.format == MessageDefinitionFormat.IDL:
-                types = {}
-                for part in definition.data.split(_IDL_SEPARATOR):
-                    if part:
-                        text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
-                        types.update(get_types_from_idl(text))
-            elif connection.msgtype in own.fielddefs:
-                types = dict(own.fielddefs)
-            else:
+    definition = connection.msgdef
+    try:
+        if definition.format == MessageDefinitionFormat.MSG:
+            types = get_types_from_msg(definition.data, connection.msgtype)
+        elif definition.format == MessageDefinitionFormat.IDL:
+            types = {}
+            for part in definition.data.split(_IDL_SEPARATOR):
+                if part:
+                    text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+                    types.update(get_types_from_idl(text))
+        else:
+            types = dict(make_typestore().fielddefs)
+            if connection.msgtype not in types:
                 raise DataError(
                     f"{path}: topic {connection.topic} has type {connection.msgtype}, which "
                     "the bag does not define and we do not know"
                 )
-            store.register({name: t for name, t in types.items() if name not in store.fielddefs})
-        except TypesysError as error:
-            raise DataError(f"{path}: bad definition of {connection.msgtype}: {error}") from error
+        store.register({name: t for name, t in types.items() if name not in store.fielddefs})
+    except TypesysError as error:
+        raise DataError(f"{path}: bad definition of {connection.msgtype}: {error}") from error
     return store
 
 
