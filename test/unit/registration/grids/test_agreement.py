@@ -63,5 +63,5 @@ def test_a_map_shares_with_itself_all_that_it_knows(sides):
     source, _ = sides
     same = measure_agreement(source, source, SE2())
     assert same.overlap == 1.0
-    assert same.chance == (source.seen == 2).sum() / source.num_known
+    assert same.wall_share == (source.seen == 2).sum() / source.num_known
     assert source.num_known == (source.cells.known > 0.5).sum()

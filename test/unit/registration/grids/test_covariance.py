@@ -26,7 +26,7 @@ def _problem(pair: MapPair) -> GridProblem:
 
 def _truth(pair: MapPair, problem: GridProblem) -> np.ndarray:
     target, source = pair.target.spec.T_frame_grid, pair.source.spec.T_frame_grid
-    return problem.to_pose(target.inverse() @ pair.T_target_source @ source)
+    return problem.pose_of(target.inverse() @ pair.T_target_source @ source)
 
 
 @pytest.fixture(scope="module")

@@ -71,7 +71,7 @@ def test_the_climb_ends_on_a_maximum_as_good_as_scipys():
 def _agreement(**given):
     values = {
         "overlap": 0.5, "num_walls": 800, "agreement": 0.9, "conflict": 0.04, "inlier_ratio": 0.5,
-        "residual_cells": 0.8, "chance": 0.08, "num_detail": 200.0,
+        "residual_cells": 0.8, "wall_share": 0.08, "num_detail": 200.0,
     }  # fmt: skip
     return Agreement(**{**values, **given})
 
@@ -203,6 +203,6 @@ def test_chance_is_the_share_of_the_common_area_near_walls():
     values[50] = 100
     walls = WallMap(clean_cells(OccupancyMap(GridSpec(0.1, 100, 100), values)))
     same = measure_agreement(walls, walls, SE2())
-    assert same.chance == pytest.approx(0.05, abs=0.02)  # five rows of a hundred
+    assert same.wall_share == pytest.approx(0.05, abs=0.02)  # five rows of a hundred
     assert same.agreement == 1.0
     assert same.num_detail == 0.0

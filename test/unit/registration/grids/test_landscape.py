@@ -115,8 +115,8 @@ def test_the_window_decides_on_peaks_but_not_on_chance(half_rad):
     offset[:, 0] = np.abs((offset[:, 0] + math.pi) % (2.0 * math.pi) - math.pi)
     assert 0 < len(narrow.poses) <= 10
     assert (offset <= window.half + np.array([1e-9, 1.0, 1.0])).all()
-    np.testing.assert_allclose(narrow.chance_poses, whole.chance_poses)
-    np.testing.assert_allclose(narrow.chance_scores, whole.chance_scores, atol=1e-6)
+    np.testing.assert_allclose(narrow.background_poses, whole.background_poses)
+    np.testing.assert_allclose(narrow.background_scores, whole.background_scores, atol=1e-6)
 
 
 def test_threads_at_once_find_the_same_to_the_last_bit():
@@ -127,7 +127,7 @@ def test_threads_at_once_find_the_same_to_the_last_bit():
     for one, other in zip(alone, at_once, strict=True):
         np.testing.assert_array_equal(one.poses, other.poses)
         np.testing.assert_array_equal(one.scores, other.scores)
-        np.testing.assert_array_equal(one.chance_scores, other.chance_scores)
+        np.testing.assert_array_equal(one.background_scores, other.background_scores)
 
 
 def test_a_turned_map_is_drawn_whole_and_nothing_else_is_touched():

@@ -40,7 +40,7 @@ def test_the_true_pose_is_a_candidate_among_thin_walls(thin_walled):
     pyramid, _ = prepare_maps(pair.source, pair.target, config)
     found, _ = scan_candidates(pyramid, whole_plane(pyramid.scanned))
     frames = GridFrames(pair.source.spec, pair.target.spec)
-    T_found = [frames.to_frames(pyramid.searched.to_motion(c.pose)) for c in found]
+    T_found = [frames.to_frames(pyramid.searched.motion_of(c.pose)) for c in found]
     assert any(is_right(pair, T) for T in T_found)
 
 
@@ -71,5 +71,5 @@ def test_poses_are_counted_in_units_however_fine_the_scan(thin_walled):
 def test_where_no_other_pose_is_known_nothing_stands_out():
     pose = np.array([[0.1, 4.0, 5.0]])
     landscape = Landscape(pose, np.array([0.7]), pose, np.array([0.7]))
-    chance = candidates._chance(candidates.Candidate(pose[0], 0.7), landscape, 20.0)
+    chance = candidates._background(candidates.Candidate(pose[0], 0.7), landscape, 20.0)
     assert chance.surprise(0.7) == 0.0

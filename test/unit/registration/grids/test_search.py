@@ -110,8 +110,8 @@ def test_gradient_is_that_of_the_objective(problem):
 
 def test_poses_and_motions_undo_each_other(problem):
     pose = np.array([0.7, 3.0, -2.0])
-    motion = problem.to_motion(pose)
-    np.testing.assert_allclose(problem.to_pose(motion), pose, atol=1e-12)
+    motion = problem.motion_of(pose)
+    np.testing.assert_allclose(problem.pose_of(motion), pose, atol=1e-12)
     cells = problem.source_points + problem.center
     turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
     expected = problem.source_points @ turn.T + pose[1:]

@@ -284,7 +284,7 @@ def test_boxes_and_all_their_children_are_bounded(kind):
             for centre, widths in boxes:
                 steps = rng.uniform(-1.0, 1.0, (12, 3))
                 steps[:4] = np.sign(steps[:4])
-                poses = [mixtures.centred(problem.to_pose(*p)) for p in centre + widths * steps]
+                poses = [mixtures.centred(problem.motion_of(*p)) for p in centre + widths * steps]
                 highest = mixtures.values(np.array(poses)).max()
                 first, early, second = bounds_of(problem, [*centre, *widths], 0.8 * highest)
                 assert highest <= min(first, second) + slack + problem.margin
@@ -345,7 +345,7 @@ def is_near(outcome, a, b, radii=1.0):
 
 def is_known(outcome, T):
     problem = outcome.neighborhoods.problem
-    known = [problem.to_pose(*row[1:]) for row in outcome.neighborhoods.optima]
+    known = [problem.motion_of(*row[1:]) for row in outcome.neighborhoods.optima]
     return any(is_near(outcome, T, other) for other in known)
 
 

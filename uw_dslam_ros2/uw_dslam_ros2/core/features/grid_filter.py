@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 
-__all__ = ["CellEvidence", "clean_cells", "coarsen"]
+__all__ = ["FilteredCells", "clean_cells", "coarsen"]
 
 FloatGrid = NDArray[np.float32]
 
@@ -26,7 +26,7 @@ _MAJORITY_WIDTH_CELLS = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CellEvidence:
+class FilteredCells:
     """Evidence of a grid's cells, each array (R, C) float32 in [0, 1].
 
     ``wall`` is that of a wall somewhere in the cell, ``free`` and ``known`` are shares of the
@@ -99,7 +99,7 @@ def _surface(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return wall & (inside == 0)
 
 
-def clean_cells(occupancy: OccupancyMap) -> CellEvidence:
+def clean_cells(occupancy: OccupancyMap) -> FilteredCells:
     """Drop specks from a map (R, C).
 
     A wall cell stays where a line of nine cells through it holds a line's worth of walls; free and
@@ -118,7 +118,7 @@ def clean_cells(occupancy: OccupancyMap) -> CellEvidence:
     evidence = np.zeros(values.shape, np.float32)
     evidence[wall] = np.clip((values[wall].astype(np.float32) - 50.0) / 40.0, 0.0, 1.0)
     rows, cols = (np.arange(size, dtype=np.float32) + np.float32(0.5) for size in values.shape)
-    return CellEvidence(
+    return FilteredCells(
         occupancy.spec.resolution_m,
         evidence,
         free.astype(np.float32),
@@ -135,7 +135,7 @@ def _is_majority(mask: NDArray[np.bool_], border: int) -> NDArray[np.bool_]:
     return count > _MAJORITY_WIDTH_CELLS**2 // 2
 
 
-def coarsen(cells: CellEvidence, resolution_m: float) -> CellEvidence:
+def coarsen(cells: FilteredCells, resolution_m: float) -> FilteredCells:
     """The same evidence on larger cells whose grid starts at the same corner; any ratio from 1 up.
 
     The wall's place inside a large cell is the mean of the small wall cells in it, so that no
@@ -155,7 +155,7 @@ def coarsen(cells: CellEvidence, resolution_m: float) -> CellEvidence:
         sums = np.stack([_block_sum(values, starts) for values in counted])
     wall_sum, free_sum, known_sum, row_sum, col_sum, count = sums
     weight = np.maximum(wall_sum, np.float32(1e-9))
-    return CellEvidence(
+    return FilteredCells(
         resolution_m,
         # A line through a block of k x k cells fills k of them; half of that is a wall.
         np.minimum(wall_sum * np.float32(2.0) / np.sqrt(count), np.float32(1.0)),

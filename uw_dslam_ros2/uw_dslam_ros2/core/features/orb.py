@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+from uw_dslam_ros2.core.features.grid_filter import FilteredCells
 
 __all__ = ["orb_points"]
 
@@ -19,7 +19,7 @@ _WALL_RADIUS_CELLS = 2
 _FREE_GREY, _UNKNOWN_GREY, _WALL_GREY = 255, 205, 0
 
 
-def orb_points(cells: CellEvidence, max_points: int) -> tuple[FloatArray, FloatArray]:
+def orb_points(cells: FilteredCells, max_points: int) -> tuple[FloatArray, FloatArray]:
     """At most ``max_points`` keypoints [x, y] (N, 2) in cells, and weights (N,) of sum 1.
 
     Keypoints of all scales of the pyramid count if a wall lies within two cells and free space

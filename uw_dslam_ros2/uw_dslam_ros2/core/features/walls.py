@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+from uw_dslam_ros2.core.features.grid_filter import FilteredCells
 
 __all__ = ["wall_points"]
 
@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 
 
 def wall_points(
-    cells: CellEvidence, max_points: int, spacing_cells: float = 1.0
+    cells: FilteredCells, max_points: int, spacing_cells: float = 1.0
 ) -> tuple[FloatArray, FloatArray]:
     """At most ``max_points`` wall points [x, y] (N, 2) in cells, and weights (N,) of sum 1.
 

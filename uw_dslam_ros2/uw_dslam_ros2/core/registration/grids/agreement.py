@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+from uw_dslam_ros2.core.features.grid_filter import FilteredCells
 from uw_dslam_ros2.core.registration.grids import agreement_kernels
 from uw_dslam_ros2.core.registration.grids.lines import off_strongest_lines
 from uw_dslam_ros2.core.registration.grids.signed_field import wall_distance
@@ -28,7 +28,7 @@ class Agreement:
     map inside the other's seen area (``num_walls``), ``agreement`` is the share with a wall near
     and ``conflict`` the share on free space with none near. ``inlier_ratio`` of
     the source's wall cells have a partner. ``residual_cells`` is the root mean square
-    distance of the partners. ``chance`` is the share of the common area that is that near to a
+    distance of the partners. ``wall_share`` is the share of the common area that is that near to a
     wall: what a wall cell dropped anywhere would find. ``num_detail`` of the agreeing wall cells
     lie off the few straight lines that hold most of them: any room has straight walls, so they
     tell one place from another.
@@ -40,14 +40,14 @@ class Agreement:
     conflict: float
     inlier_ratio: float
     residual_cells: float
-    chance: float
+    wall_share: float
     num_detail: float
 
 
 class WallMap:
     """Distance to walls, free share and walls of a map, made once for all poses."""
 
-    def __init__(self, cells: CellEvidence) -> None:
+    def __init__(self, cells: FilteredCells) -> None:
         self.cells = cells
         is_wall = cells.wall > 0.25
         self.distance = wall_distance(cells)
@@ -71,11 +71,14 @@ _FAR_CELLS = 3.5
 _LEAST_FREE = 0.6  # share of free cells around a wall that make it contradict the other map
 
 
-def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreement:
-    """Agreement of two maps of one resolution; ``T_cells`` maps source to target cells [x, y]."""
+def measure_agreement(source: WallMap, target: WallMap, T_target_source: SE2) -> Agreement:
+    """Agreement of two maps of one resolution; ``T_target_source`` is in cells [x, y]."""
     seen, near, conflict, square, inliers = 0, 0, 0, 0.0, 0.0
     agreeing = []
-    for walls, other, T_other in ((source, target, T_cells), (target, source, T_cells.inverse())):
+    for walls, other, T_other in (
+        (source, target, T_target_source),
+        (target, source, T_target_source.inverse()),
+    ):
         is_near = np.empty(len(walls.points), np.bool_)
         counts = agreement_kernels.compare_walls(
             walls.points, math.cos(T_other.yaw), math.sin(T_other.yaw), T_other.x, T_other.y,
@@ -85,10 +88,10 @@ def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreeme
         seen, near, conflict = seen + counts[0], near + counts[1], conflict + counts[2]
         square += counts[3]
         points = walls.points[is_near]
-        agreeing.append(T_cells.apply(points) if walls is source else points)
+        agreeing.append(T_target_source.apply(points) if walls is source else points)
         if walls is source:
             inliers = counts[1] / max(len(is_near), 1)
-    overlap, chance = _common_area(source, target, T_cells)
+    overlap, wall_share = _common_area(source, target, T_target_source)
     return Agreement(
         overlap,
         seen,
@@ -96,7 +99,7 @@ def measure_agreement(source: WallMap, target: WallMap, T_cells: SE2) -> Agreeme
         conflict / max(seen, 1),
         inliers,
         float(np.sqrt(square / max(near, 1))),
-        chance,
+        wall_share,
         near * _detail_share(np.concatenate(agreeing)),
     )
 
@@ -112,10 +115,10 @@ def _detail_share(points: FloatArray) -> float:
     return float(is_left.mean())
 
 
-def _common_area(source: WallMap, target: WallMap, T_cells: SE2) -> tuple[float, float]:
+def _common_area(source: WallMap, target: WallMap, T_target_source: SE2) -> tuple[float, float]:
     """Area seen by both over the smaller seen area, and the share of it that is near a wall."""
     rows, cols = target.seen.shape
-    matrix = T_cells.matrix()[:2].copy()
+    matrix = T_target_source.matrix()[:2].copy()
     matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts from cell centres
     moved = cv2.warpAffine(source.seen, matrix, (cols, rows), flags=cv2.INTER_NEAREST)
     both, near = agreement_kernels.count_common(moved, target.seen)

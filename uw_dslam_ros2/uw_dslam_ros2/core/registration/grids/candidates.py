@@ -14,7 +14,7 @@ from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid, carried
 from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome
 from uw_dslam_ros2.core.se2 import wrap_angle
 
-__all__ = ["Candidate", "Chance", "climb", "log_volume", "merge_best", "scan_candidates"]
+__all__ = ["Background", "Candidate", "climb", "log_volume", "merge_best", "scan_candidates"]
 
 FloatArray = NDArray[np.float64]
 _NUM_PEAKS = 300  # of the scan: at 65 cells that is most of them
@@ -32,7 +32,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Chance:
+class Background:
     """Mean and standard deviation of the best scores that other rotations reach by chance."""
 
     mean: float
@@ -45,7 +45,7 @@ class Chance:
 
 def scan_candidates(
     pyramid: Pyramid, window: PoseWindow, num_peaks: int = _NUM_PEAKS
-) -> tuple[list[Candidate], Chance]:
+) -> tuple[list[Candidate], Background]:
     """Local maxima of the searched problem, best first, and what chance reaches.
 
     ``window`` is in cells of the scanned problem. There, a thin wall is hardly more than the free
@@ -57,14 +57,14 @@ def scan_candidates(
     peaks = [c for c in climb(scanned, landscape.poses) if _is_inside(window, c.pose)]
     if not peaks:
         peaks = [Candidate(window.middle, scanned.value(window.middle))]
-    chance = _chance(peaks[0], landscape, scanned.radius)
+    background = _background(peaks[0], landscape, scanned.radius)
     poses = np.array([peak.pose for peak in peaks])
     if searched is scanned:
-        return peaks[:_NUM_CANDIDATES], chance
+        return peaks[:_NUM_CANDIDATES], background
     climbed = climb(searched, carried(scanned, searched, poses))
     back = carried(searched, scanned, np.array([c.pose for c in climbed]))
     inside = [c for c, pose in zip(climbed, back, strict=True) if _is_inside(window, pose)]
-    return (inside or climbed)[:_NUM_CANDIDATES], chance
+    return (inside or climbed)[:_NUM_CANDIDATES], background
 
 
 def climb(problem: GridProblem, poses: FloatArray) -> list[Candidate]:
@@ -100,13 +100,13 @@ def _is_inside(window: PoseWindow, pose: FloatArray) -> bool:
     return bool((np.abs(offset) <= window.half + 1e-9).all())
 
 
-def _chance(best: Candidate, landscape: Landscape, radius: float) -> Chance:
-    offset = landscape.chance_poses - best.pose
+def _background(best: Candidate, landscape: Landscape, radius: float) -> Background:
+    offset = landscape.background_poses - best.pose
     turn = np.abs((offset[:, 0] + math.pi) % (2.0 * math.pi) - math.pi)
     is_own = (turn * radius < _OWN_PEAK_CELLS) & (
         np.hypot(offset[:, 1], offset[:, 2]) < _OWN_PEAK_CELLS
     )
-    others = landscape.chance_scores[~is_own]
+    others = landscape.background_scores[~is_own]
     if len(others) < _LEAST_OTHERS:  # nothing is known of chance, so nothing stands out
-        return Chance(best.score, 1.0)
-    return Chance(float(np.mean(others)), max(float(np.std(others)), 0.02 * best.score, 1e-9))
+        return Background(best.score, 1.0)
+    return Background(float(np.mean(others)), max(float(np.std(others)), 0.02 * best.score, 1e-9))

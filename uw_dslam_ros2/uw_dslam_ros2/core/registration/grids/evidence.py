@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration.grids.agreement import WallMap, measure_agreement
-from uw_dslam_ros2.core.registration.grids.candidates import Candidate, Chance, climb, log_volume
+from uw_dslam_ros2.core.registration.grids.candidates import (
+    Background,
+    Candidate,
+    climb,
+    log_volume,
+)
 from uw_dslam_ros2.core.registration.grids.covariance import slide_share
 from uw_dslam_ros2.core.registration.grids.probability import (
     MatchEvidence,
@@ -34,7 +39,7 @@ class Found:
 
     refined: list[Candidate]
     evidence: MatchEvidence
-    chance: Chance
+    background: Background
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,16 +51,16 @@ class Judge:
 
     sides: tuple[WallMap, WallMap]
     pyramid: Pyramid
-    chance: Chance
+    background: Background
 
     def evidence(self, candidate: Candidate) -> PoseEvidence:
         """Evidence for a pose of the finest level."""
         scanned, finest = self.pyramid.scanned, self.pyramid.finest
-        T_grids = finest.to_motion(candidate.pose)
+        T_target_source = finest.motion_of(candidate.pose)
         scale = 1.0 / finest.resolution_m
-        T_cells = SE2(T_grids.x * scale, T_grids.y * scale, T_grids.yaw)
-        surprise = self.chance.surprise(scanned.value(scanned.to_pose(T_grids)))
-        return PoseEvidence(measure_agreement(*self.sides, T_cells), candidate.score, surprise)
+        in_cells = SE2(T_target_source.x * scale, T_target_source.y * scale, T_target_source.yaw)
+        surprise = self.background.surprise(scanned.value(scanned.pose_of(T_target_source)))
+        return PoseEvidence(measure_agreement(*self.sides, in_cells), candidate.score, surprise)
 
 
 def weigh(
@@ -63,14 +68,14 @@ def weigh(
     pyramid: Pyramid,
     window: PoseWindow,
     candidates: list[Candidate],
-    chance: Chance,
+    background: Background,
 ) -> Found:
     """Refine candidates of the searched problem on the finest one, and compare them.
 
     ``sides`` as for `Judge`; ``window`` in cells of the scanned problem.
     """
     finest, volume = pyramid.finest, log_volume(pyramid, window)
-    judge = Judge(sides, pyramid, chance)
+    judge = Judge(sides, pyramid, background)
     weighed = [(c, judge.evidence(c)) for c in refine(pyramid, candidates, _NUM_REFINED)]
     # The objective counts what overlaps, so a pose that lays much on much may score above the true
     # one though the maps contradict it: evidence decides.
@@ -84,7 +89,7 @@ def weigh(
         slide_share=slide_share(finest, best.pose, _SLIDE_CELLS),
         log_volume=volume,
     )
-    return Found(list(refined), evidence, chance)
+    return Found(list(refined), evidence, background)
 
 
 def refine(pyramid: Pyramid, candidates: list[Candidate], limit: int) -> list[Candidate]:

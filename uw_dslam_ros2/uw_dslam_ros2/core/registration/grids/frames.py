@@ -30,9 +30,9 @@ class GridFrames:
         """Motion between frames to motion between the grids' own axes."""
         return self.target.T_frame_grid.inverse() @ T_target_source @ self.source.T_frame_grid
 
-    def to_frames(self, T_grids: SE2) -> SE2:
+    def to_frames(self, T_target_source: SE2) -> SE2:
         """Undo `to_grids`."""
-        return self.target.T_frame_grid @ T_grids @ self.source.T_frame_grid.inverse()
+        return self.target.T_frame_grid @ T_target_source @ self.source.T_frame_grid.inverse()
 
     def source_points(self, cells: FloatArray, problem: GridProblem) -> FloatArray:
         """Points (N, 2) in a problem's cells of the source to metres in its frame."""
@@ -47,7 +47,7 @@ class GridFrames:
         plane = whole_plane(problem)
         if prior is None:
             return plane
-        middle = problem.to_pose(self.to_grids(prior.T_target_source))
+        middle = problem.pose_of(self.to_grids(prior.T_target_source))
         half_rad = min(prior.half_width_rad, math.pi)
         # The prior speaks of where the source's frame lands, the pose of where its centre does.
         T_grid_frame = self.source.T_frame_grid.inverse()

@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 FloatStack = NDArray[np.float32]
 _PEAKS_PER_ROTATION = 4
 _PEAK_RADIUS = 3  # cells
-_CHANCE_STRIDE = 4  # rotations
+_BACKGROUND_STRIDE = 4  # rotations
 _STACK_CELLS = 200_000  # some rotations at a time: fewer calls, and a stack that fits the cache
 
 
@@ -29,14 +29,15 @@ _STACK_CELLS = 200_000  # some rotations at a time: fewer calls, and a stack tha
 class Landscape:
     """Peaks of the objective, best first: ``poses`` (K, 3), ``scores`` (K,).
 
-    ``chance_poses`` (L, 3) and ``chance_scores`` (L,) are the best of evenly spaced rotations over
-    the whole plane, whatever the window: what alignments of these two maps reach by chance.
+    ``background_poses`` (L, 3) and ``background_scores`` (L,) are the best of evenly
+    spaced rotations over the whole plane, whatever the window: what alignments of these two
+    maps reach by accident.
     """
 
     poses: FloatArray
     scores: FloatArray
-    chance_poses: FloatArray
-    chance_scores: FloatArray
+    background_poses: FloatArray
+    background_scores: FloatArray
 
 
 def scan_landscape(
@@ -52,14 +53,16 @@ def scan_landscape(
     num_rotations = max(16, math.ceil(2.0 * math.pi * problem.radius * 1.2 / 1.3))
     peaks, greatest = scan.best(_rotations(num_rotations, window), window)
     if _is_whole(num_rotations, window):
-        chance = greatest[::_CHANCE_STRIDE]
+        background = greatest[::_BACKGROUND_STRIDE]
     else:
-        _, chance = scan.best(_rotations(num_rotations, None)[::_CHANCE_STRIDE].copy(), None)
+        _, background = scan.best(
+            _rotations(num_rotations, None)[::_BACKGROUND_STRIDE].copy(), None
+        )
     peaks = peaks.reshape(-1, 4)
     peaks = peaks[peaks[:, 3] > -np.inf]
     peaks = peaks[np.argsort(peaks[:, 3], kind="stable")[::-1]]
     peaks = peaks[distinct(peaks[:, :3], problem.radius, 3.0, num_peaks)]
-    return Landscape(peaks[:, :3].copy(), peaks[:, 3].copy(), chance[:, :3], chance[:, 3])
+    return Landscape(peaks[:, :3].copy(), peaks[:, 3].copy(), background[:, :3], background[:, 3])
 
 
 def _is_whole(num_rotations: int, window: PoseWindow | None) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uw_dslam_ros2.core.features.grid_filter import CellEvidence, clean_cells, coarsen
+from uw_dslam_ros2.core.features.grid_filter import FilteredCells, clean_cells, coarsen
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grids.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
@@ -94,7 +94,7 @@ def _wall_spacing(walls: WallMap) -> float:
 
 
 def _too_little(
-    name: str, occupancy: OccupancyMap, cells: CellEvidence, min_wall_cells: int
+    name: str, occupancy: OccupancyMap, cells: FilteredCells, min_wall_cells: int
 ) -> str | None:
     """What a map lacks for matching, as a sentence, or None."""
     rows, cols = occupancy.spec.shape

@@ -74,7 +74,7 @@ POSE_FEATURES = (
     "agreement",
     "conflict",
     "log_detail",
-    "chance",
+    "wall_share",
     "log_surprise",
     "log_volume",
 )
@@ -104,7 +104,7 @@ def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
         agreement.agreement,
         agreement.conflict,
         math.log1p(min(agreement.num_detail, ENOUGH_DETAIL)),
-        agreement.chance,
+        agreement.wall_share,
         math.log(min(max(pose.surprise, 0.5), 30.0)),
         log_volume,
     )
@@ -122,7 +122,7 @@ def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tupl
 def _serious_rivals(evidence: MatchEvidence) -> list[PoseEvidence]:
     """Rivals that may be the true pose of a place that looks like itself.
 
-    The true pose agrees as well as its twin, for the maps are the same, and in the same kind of
+    The true pose agrees as well as its alias, for the maps are the same, and in the same kind of
     detail. What agrees significantly less is repeated walls: the best pose would have to agree
     better by chance than the true one.
     """

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+from uw_dslam_ros2.core.features.grid_filter import FilteredCells
 from uw_dslam_ros2.core.features.walls import wall_points
 from uw_dslam_ros2.core.registration.grids.signed_field import signed_field
 from uw_dslam_ros2.core.registration.search.field import Field
@@ -115,7 +115,7 @@ class GridProblem:
         found, values = zip(*climbed, strict=True) if climbed else ((), ())
         return np.array(found).reshape(-1, 3), np.array(values)
 
-    def to_motion(self, pose: FloatArray) -> SE2:
+    def motion_of(self, pose: FloatArray) -> SE2:
         """Pose (3,) in working cells to the motion between the grids' own axes [m]."""
         shift = SE2(0.5 * self.resolution_m, 0.5 * self.resolution_m, 0.0)
         turned = SE2(
@@ -124,8 +124,8 @@ class GridProblem:
         center = self.center * self.resolution_m
         return shift @ turned @ SE2(-center[0], -center[1], 0.0) @ shift.inverse()
 
-    def to_pose(self, T_target_source: SE2) -> FloatArray:
-        """Undo `to_motion`."""
+    def pose_of(self, T_target_source: SE2) -> FloatArray:
+        """Undo `motion_of`."""
         shift = SE2(0.5 * self.resolution_m, 0.5 * self.resolution_m, 0.0)
         center = self.center * self.resolution_m
         turned = shift.inverse() @ T_target_source @ shift @ SE2(center[0], center[1], 0.0)
@@ -133,8 +133,8 @@ class GridProblem:
 
 
 def build_problem(
-    source: CellEvidence,
-    target: CellEvidence,
+    source: FilteredCells,
+    target: FilteredCells,
     *,
     stride: int,
     sigma_cells: float,

@@ -54,4 +54,4 @@ def carried(coarse: GridProblem, fine: GridProblem, poses: FloatArray) -> FloatA
     """Poses (K, 3) of one problem as those of another one of the same maps."""
     if coarse is fine or len(poses) == 0:
         return poses
-    return np.array([fine.to_pose(coarse.to_motion(pose)) for pose in poses])
+    return np.array([fine.pose_of(coarse.motion_of(pose)) for pose in poses])

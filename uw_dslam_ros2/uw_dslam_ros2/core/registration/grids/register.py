@@ -28,7 +28,7 @@ from uw_dslam_ros2.core.registration.grids.probability import (
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid
 from uw_dslam_ros2.core.registration.grids.search import search_poses
-from uw_dslam_ros2.core.registration.grids.symmetry import add_twins
+from uw_dslam_ros2.core.registration.grids.symmetry import add_symmetric_rivals
 from uw_dslam_ros2.core.registration.grids.verdict import Proof, decide
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
@@ -149,8 +149,8 @@ class _GridMatch:
         pyramid, walls = prepared
         searched = pyramid.searched
         window = self._frames.window(pyramid.scanned, self._prior)
-        candidates, chance = scan_candidates(pyramid, window)
-        found = weigh(walls, pyramid, window, candidates, chance)
+        candidates, background = scan_candidates(pyramid, window)
+        found = weigh(walls, pyramid, window, candidates, background)
         verdict, _, _ = decide(found.evidence, self._config)
         # What the evidence refuses anyway gets a short search, which may find better.
         num_boxes = self._config.max_boxes
@@ -168,8 +168,10 @@ class _GridMatch:
         if is_better or (verdict is Verdict.ACCEPTED and not outcome.is_complete):
             # Where the proof is open, the poses that it could not exclude are rivals like others.
             candidates = merge_best(searched, candidates, outcome)
-            found = weigh(walls, pyramid, window, candidates, chance)
-        return self._answer(pyramid, outcome, _with_twins(found, walls, pyramid, window))
+            found = weigh(walls, pyramid, window, candidates, background)
+        return self._answer(
+            pyramid, outcome, _with_symmetric_rivals(found, walls, pyramid, window)
+        )
 
     def collect(self) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
         """Evidence, and that of each pose by itself; None where a map holds too little."""
@@ -180,8 +182,8 @@ class _GridMatch:
         window = self._frames.window(pyramid.scanned, self._prior)
         found = weigh(walls, pyramid, window, *scan_candidates(pyramid, window))
         weighed = (found.evidence.best, *found.evidence.rivals)
-        motions = [self._frames.to_frames(pyramid.finest.to_motion(c.pose)) for c in found.refined]
-        evidence = _with_twins(found, walls, pyramid, window).evidence
+        motions = [self._frames.to_frames(pyramid.finest.motion_of(c.pose)) for c in found.refined]
+        evidence = _with_symmetric_rivals(found, walls, pyramid, window).evidence
         return evidence, list(zip(weighed, motions, strict=True))
 
     def _certify(
@@ -201,7 +203,7 @@ class _GridMatch:
         def report(told: Progress) -> None:
             if progress is not None:
                 T = told.T_target_source
-                motion = problem.to_motion(np.array([T.yaw, T.x, T.y]))
+                motion = problem.motion_of(np.array([T.yaw, T.x, T.y]))
                 progress(replace(told, T_target_source=self._frames.to_frames(motion)))
 
         outcome = search_poses(
@@ -216,7 +218,7 @@ class _GridMatch:
     ) -> RegistrationResult:
         work, finest = pyramid.searched, pyramid.finest
         pose, agreement = found.refined[0].pose, found.evidence.best.agreement
-        at_work = work.to_pose(finest.to_motion(pose))
+        at_work = work.pose_of(finest.motion_of(pose))
         score, (_, summit) = work.value(at_work), work.ascend(at_work)
         proof = Proof(
             is_complete=outcome.is_complete,
@@ -230,12 +232,12 @@ class _GridMatch:
         verdict, reason, probability = decide(found.evidence, self._config, proof=proof)
         if verdict is Verdict.TOO_FEW_FEATURES:
             return self._refused(verdict, reason)
-        motion = self._frames.to_frames(finest.to_motion(pose))
+        motion = self._frames.to_frames(finest.motion_of(pose))
         bound = outcome.upper_bound / max(score, 1e-12)
         best_score = max(found.evidence.best.score, 1e-9)
         rivals = tuple(
             Rival(
-                self._frames.to_frames(finest.to_motion(c.pose)), rival.score / best_score, bound
+                self._frames.to_frames(finest.motion_of(c.pose)), rival.score / best_score, bound
             )
             for c, rival in zip(found.refined[1:], found.evidence.rivals, strict=True)
             if rival.score > _RIVAL_SHARE * best_score or verdict is Verdict.AMBIGUOUS
@@ -274,10 +276,10 @@ class _GridMatch:
         return RegistrationResult.refused(verdict, reason, seconds=self._elapsed())
 
 
-def _with_twins(
+def _with_symmetric_rivals(
     found: Found, walls: tuple[WallMap, WallMap], pyramid: Pyramid, window: PoseWindow
 ) -> Found:
     """Symmetries only matter to a match that would be convincing without them."""
     if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_TWINS:
         return found
-    return add_twins(found, walls, pyramid, window)
+    return add_symmetric_rivals(found, walls, pyramid, window)

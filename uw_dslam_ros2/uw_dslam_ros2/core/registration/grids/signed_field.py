@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.features.grid_filter import CellEvidence
+from uw_dslam_ros2.core.features.grid_filter import FilteredCells
 from uw_dslam_ros2.core.registration.search.field import Field
 
 __all__ = ["PAD", "padded_field", "signed_field", "wall_distance"]
@@ -19,7 +19,7 @@ PAD = 3
 """Cells of zeros around a field, so that it ends at zero."""
 
 
-def wall_distance(cells: CellEvidence) -> FloatGrid:
+def wall_distance(cells: FilteredCells) -> FloatGrid:
     """Distance (R, C) from cells to the nearest wall, in cells; infinite without any wall."""
     is_wall = cells.wall > 0.25
     if not is_wall.any():
@@ -35,7 +35,7 @@ def wall_distance(cells: CellEvidence) -> FloatGrid:
 
 
 def signed_field(
-    cells: CellEvidence,
+    cells: FilteredCells,
     sigma_cells: float,
     free_penalty: float,
     stride: int = 1,

@@ -20,7 +20,7 @@ from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid, carried
 from uw_dslam_ros2.core.registration.grids.search import whole_plane
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["add_twins"]
+__all__ = ["add_symmetric_rivals"]
 
 _NUM_SELF_MATCHES = 3
 _NUM_PEAKS = 40  # a likeness worth a doubt stands out
@@ -37,7 +37,7 @@ class _Likeness:
     evidence: PoseEvidence
 
 
-def add_twins(
+def add_symmetric_rivals(
     found: Found,
     sides: tuple[WallMap, WallMap],
     pyramid: Pyramid,
@@ -51,27 +51,29 @@ def add_twins(
     likeness, and at most as the match.
     """
     finest, evidence = pyramid.finest, found.evidence
-    T_best = finest.to_motion(found.refined[0].pose)
-    twins = []
+    T_target_source = finest.motion_of(found.refined[0].pose)
+    aliases = []
     for is_source, walls in zip((True, False), sides, strict=True):
         itself = replace(
             pyramid, problems=tuple(_on_itself(p, is_source) for p in pyramid.problems)
         )
         for likeness in _likenesses(walls, itself):
             for T_self in (likeness.T_self, likeness.T_self.inverse()):
-                twins.append((T_best @ T_self if is_source else T_self @ T_best, likeness))
-    if not twins:
+                aliases.append(
+                    (T_target_source @ T_self if is_source else T_self @ T_target_source, likeness)
+                )
+    if not aliases:
         return found
-    judge = Judge(sides, pyramid, found.chance)
+    judge = Judge(sides, pyramid, found.background)
 
     def logit(pose: PoseEvidence) -> float:
         return pose_logit(pose, evidence.log_volume)
 
     refined, rivals = list(found.refined), list(evidence.rivals)
-    for T_twin, likeness in twins:
-        if not window.holds(pyramid.scanned.to_pose(T_twin)):
+    for T_alias, likeness in aliases:
+        if not window.holds(pyramid.scanned.pose_of(T_alias)):
             continue
-        candidate = _settled(finest, T_twin)
+        candidate = _climbed(finest, T_alias)
         same = [k for k, c in enumerate(refined) if is_same_pose(finest, c.pose, candidate.pose)]
         if same and same[0] == 0:
             continue
@@ -87,9 +89,9 @@ def add_twins(
     return replace(found, refined=refined, evidence=replace(evidence, rivals=tuple(rivals)))
 
 
-def _settled(problem: GridProblem, T_twin: SE2) -> Candidate:
+def _climbed(problem: GridProblem, T_alias: SE2) -> Candidate:
     """The maximum near a pose, or the pose where there is none."""
-    start = problem.to_pose(T_twin)
+    start = problem.pose_of(T_alias)
     candidate = Candidate(*problem.ascend(start))
     if is_same_pose(problem, candidate.pose, start):
         return candidate
@@ -119,8 +121,8 @@ def _likenesses(walls: WallMap, pyramid: Pyramid) -> list[_Likeness]:
     window = PoseWindow(
         np.array([0.5 * math.pi, *plane.middle[1:]]), np.array([half_rad, *plane.half[1:]])
     )
-    candidates, chance = scan_candidates(pyramid, window, _NUM_PEAKS)
-    identity = scanned.to_pose(SE2())
+    candidates, background = scan_candidates(pyramid, window, _NUM_PEAKS)
+    identity = scanned.pose_of(SE2())
     poses = carried(searched, scanned, np.array([c.pose for c in candidates]))
     others = [
         candidate
@@ -129,11 +131,11 @@ def _likenesses(walls: WallMap, pyramid: Pyramid) -> list[_Likeness]:
     ]
     if not others:
         return []
-    judge = Judge((walls, walls), pyramid, chance)
+    judge = Judge((walls, walls), pyramid, background)
     found = []
     volume = log_volume(pyramid, plane)
     for candidate in refine(pyramid, others, _NUM_SELF_MATCHES):
-        likeness = _Likeness(finest.to_motion(candidate.pose), judge.evidence(candidate))
+        likeness = _Likeness(finest.motion_of(candidate.pose), judge.evidence(candidate))
         if pose_logit(likeness.evidence, volume) > _LEAST_LOGIT:
             found.append(likeness)
     return found

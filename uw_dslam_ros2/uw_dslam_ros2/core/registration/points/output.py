@@ -144,7 +144,7 @@ def _is_line(points: FloatArray) -> bool:
 def _values(found: KernelSearch, poses: Sequence[SE2]) -> list[float]:
     """What the search's objective says of poses."""
     problem = found.outcome.neighborhoods.problem
-    return [problem.value_at(problem.from_pose(pose))[0] for pose in poses]
+    return [problem.value_at(problem.pose_of(pose))[0] for pose in poses]
 
 
 def _rivals(

@@ -55,7 +55,9 @@ _LAST_BOXES = 30_000  # the last search only has to offer candidates, not a proo
 _NUM_LATTICE = 100  # candidates of each lattice
 _LATTICE_ADDITIONS = 1.5e9  # points times nodes that a lattice may cost: about a second
 _MAX_CANDIDATES = 48
-_TWIN = 0.85  # a pose that explains the points as well as a decisive one scores at least this much
+_ALIAS = (
+    0.85  # a pose that explains the points as well as a decisive one scores at least this much
+)
 _MAX_SIGMA = 1.2  # most noise that is believed in, in spacings: beyond, partners are guesswork
 _DECISIVE = 1e-4  # probability of chance below which nothing further need be tried
 _INDEPENDENT = 0.3  # kernel, in spacings, that the points' independence is judged with
@@ -302,7 +304,7 @@ class _Match:
         """Refined optima with their evidence, best first, each pose once."""
         found: list[Candidate] = []
         for value, x, y, theta in outcome.optima[:_MAX_CANDIDATES]:
-            if value < _TWIN * outcome.optima[0, 0] and found and self._is_decisive(found):
+            if value < _ALIAS * outcome.optima[0, 0] and found and self._is_decisive(found):
                 break
             found += self._climbed([(theta, x, y)], 0.5 * sigma_m)
         if not found:

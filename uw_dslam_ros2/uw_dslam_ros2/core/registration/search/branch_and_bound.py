@@ -80,7 +80,7 @@ _NUM_CLIMBS = 4  # and of these, climbed from
 def objective_at(terms: Sequence[Term], T_target_source: SE2) -> float:
     """The sum that `search` maximises, at a pose."""
     problem = Problem(terms)
-    return problem.value_at(problem.from_pose(T_target_source))[0]
+    return problem.value_at(problem.pose_of(T_target_source))[0]
 
 
 def search(
@@ -118,7 +118,7 @@ def search(
                 f"prior half widths are {prior.half_width_m} m and {prior.half_width_rad} rad, "
                 "expected > 0"
             )
-        problem.window[:3] = problem.from_pose(prior.T_target_source)
+        problem.window[:3] = problem.pose_of(prior.T_target_source)
         problem.window[3] = min(prior.half_width_rad, math.pi)
         problem.window[4:] = prior.half_width_m
     return maximise(
@@ -294,7 +294,7 @@ class _Search:
     def _tell(self) -> None:
         if self._progress:
             num_open, num_boxes, _ = self._state.counters.tolist()
-            pose = self._problem.to_pose(*self._state.best[1:4])
+            pose = self._problem.motion_of(*self._state.best[1:4])
             self._progress(Progress(self._stage, *self._bounds(), num_boxes, num_open, pose))
 
     def _outcome(
@@ -312,9 +312,9 @@ class _Search:
         undecided = max(self._top(), self._floor() + p.margin, self._dropped)
         neighborhoods = Neighborhoods.of(p, found, undecided, float(best[5]))
         distinct = found[neighborhoods.apart_from_better(0.2 * p.reach)]
-        poses = [p.to_pose(*row[1:4]) for row in distinct]
+        poses = [p.motion_of(*row[1:4]) for row in distinct]
         return SearchOutcome(
-            T_target_source=p.to_pose(*best[1:4]),
+            T_target_source=p.motion_of(*best[1:4]),
             pose=best[1:4].copy(),
             lower_bound=lower,
             upper_bound=upper,

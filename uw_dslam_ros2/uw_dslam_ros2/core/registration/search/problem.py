@@ -195,14 +195,14 @@ class Problem:
         low, high = np.min(lows, axis=0), np.max(highs, axis=0)
         return np.array([0.0, *(0.5 * (low + high)), math.pi, *(0.5 * (high - low))])
 
-    def to_pose(self, theta: float, x: float, y: float) -> SE2:
+    def motion_of(self, theta: float, x: float, y: float) -> SE2:
         """``T_target_source`` of the centred parameters."""
         cos, sin = math.cos(theta), math.sin(theta)
         sx, sy = self.source_center
         tx, ty = self.target_center
         return SE2(x + tx - (cos * sx - sin * sy), y + ty - (sin * sx + cos * sy), theta)
 
-    def from_pose(self, T_target_source: SE2) -> FloatArray:
+    def pose_of(self, T_target_source: SE2) -> FloatArray:
         """Centred parameters (theta, x, y) of a pose."""
         moved = T_target_source.apply(self.source_center) - self.target_center
         return np.array([T_target_source.yaw, *moved])

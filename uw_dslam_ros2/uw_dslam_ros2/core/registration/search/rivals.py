@@ -49,7 +49,7 @@ class Neighborhoods:
 
     def upper_bound(self, T_target_source: SE2) -> float:
         """Proven upper bound at a pose of the window, by the neighbourhoods that it lies in."""
-        distance = self._distances(self.problem.from_pose(T_target_source))
+        distance = self._distances(self.problem.pose_of(T_target_source))
         # A box that lies partly in a neighbourhood was split down to half widths of 0.2 reaches.
         is_inside = distance <= self.radius_m - 0.4 * self.problem.reach
         near = self.bounds[distance <= self.radius_m]
@@ -67,7 +67,7 @@ class Neighborhoods:
                 break
             touching = self._distances(self.optima[k, 1:]) <= 2.0 * self.radius_m
             upper = max(float(self.bounds[touching].max()), self.upper_undecided)
-            T = self.problem.to_pose(*self.optima[k, 1:])
+            T = self.problem.motion_of(*self.optima[k, 1:])
             rows.append([self.optima[k, 0], upper, T.x, T.y, T.yaw])
         return np.array(rows).reshape(-1, 5)
 
