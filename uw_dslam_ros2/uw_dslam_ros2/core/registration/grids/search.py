@@ -20,24 +20,25 @@ __all__ = ["search_poses", "whole_plane"]
 FloatArray = NDArray[np.float64]
 _NUM_REFINEMENTS = 2  # of the fields' lattices, for closer bounds
 _MAX_CELLS = 600_000  # of a field refined
+_RIM_CELLS = 32.0
 
 
 def whole_plane(problem: GridProblem) -> PoseWindow:
-    """All rotations, and all translations for which points of one side meet the other's field."""
-    reach_points = _greatest_norm(problem.source_points)
-    rows, cols = problem.source_field.coefficients.shape
-    corners = np.array([[0, 0], [cols, 0], [cols, rows], [0, rows]]) - PAD - problem.center
-    reach = max(reach_points, _greatest_norm(corners))
-    num_rows, num_cols = problem.target_field.coefficients.shape
-    size = np.array([num_cols, num_rows]) - 2.0 * PAD
+    """All rotations, and all translations for which points of one side meet the other's field.
+
+    And some more, by a rim: the verdict counts poses, and was fitted to counts that include it.
+    """
+    source_size, target_size = (
+        np.array(field.coefficients.shape)[::-1] - 2.0 * PAD
+        for field in (problem.source_field, problem.target_field)
+    )
+    farthest = _RIM_CELLS + np.maximum(problem.center, source_size - problem.center)
+    farthest_point = math.sqrt(float((problem.source_points**2).sum(axis=1).max()))
+    reach = max(farthest_point, float(np.hypot(*farthest)))
     low = np.minimum(problem.target_points.min(axis=0), -1.0) - reach
-    high = np.maximum(problem.target_points.max(axis=0), size) + reach
+    high = np.maximum(problem.target_points.max(axis=0), target_size) + reach
     half = 0.5 * (high - low)
     return PoseWindow(np.array([0.0, *(0.5 * (low + high))]), np.array([math.pi, *half]))
-
-
-def _greatest_norm(points: FloatArray) -> float:
-    return float(np.sqrt((points**2).sum(axis=1).max()))
 
 
 def search_poses(
@@ -61,8 +62,13 @@ def search_poses(
         num_refinements < _NUM_REFINEMENTS and 4 ** (num_refinements + 1) * num_cells <= _MAX_CELLS
     ):
         num_refinements += 1
-    box = np.concatenate([window.middle, window.half])
-    fine = Problem(problem.terms(num_refinements), np.zeros(2), np.zeros(2), box)
+    fine = Problem(problem.terms(num_refinements), np.zeros(2), np.zeros(2))
+    # Of the window, where anything can meet; beyond, the objective is zero.
+    low = np.maximum(window.middle - window.half, fine.window[:3] - fine.window[3:])[1:]
+    high = np.minimum(window.middle + window.half, fine.window[:3] + fine.window[3:])[1:]
+    fine.window[:] = np.concatenate([window.middle, window.half])
+    if (low < high).all():
+        fine.window[1:3], fine.window[4:] = 0.5 * (low + high), 0.5 * (high - low)
     return maximise(
         fine, settings, start=start, clock=clock, progress=progress, is_cancelled=is_cancelled
     )
