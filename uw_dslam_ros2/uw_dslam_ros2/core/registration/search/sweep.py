@@ -28,13 +28,13 @@ IntArray = NDArray[np.int64]
 SumArray = NDArray[np.float32]
 TableArray = NDArray[np.int16]
 
-_TURN = 1.0  # half cells that half a slab moves the mean point by, at most
+_TURN = 0.8  # half cells that half a slab moves the mean point by, at most
 _FIRST_ADDITIONS = 6e6  # points times cells of the first level, at most
 _STEPS = (2, 2, 2, 4, 8)  # table cells to a cell, from the finest level on
 _WIDTHS = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32])  # of squares, in table cells
 _LAYER_OF_WIDTH = np.searchsorted(_WIDTHS, np.arange(_WIDTHS[-1] + 1)).astype(np.int64)
 _UNITS = 32000.0  # that the highest value of a field is in its tables
-_RECTANGLES_FROM = 400  # points, on the finest level; with fewer, tables of squares are cheaper
+_RECTANGLES_FROM = 150  # points, on the finest level; with fewer, tables of squares are cheaper
 _MAX_TILES = 100_000  # of a level; 25 MB
 
 # What things cost, in nanoseconds; the first three per point.
@@ -96,26 +96,22 @@ class Sweep:
         """
         p, window = self._problem, self._problem.window
         halves = p.pitch_m * 2.0 ** np.arange(16)
-        num_slabs = np.maximum(np.ceil(window[3] * p.arm / (_TURN * halves)), 1.0).astype(int)
-        shapes = [self._shape(half_m) for half_m in halves]
-        num_cells = num_slabs * np.prod(shapes, axis=1)
-        is_cheap = num_cells * p.points.shape[1] <= _FIRST_ADDITIONS
+        num_slabs = np.ceil(np.maximum(window[3] * p.arm / (_TURN * halves), 1.0)).astype(int)
+        # Columns and rows of cells that cover the window; the last ones stick out.
+        shapes = np.ceil(window[4:, None] / halves * (1.0 + 1e-12))
+        cols, rows = np.maximum(shapes, 1.0).astype(int)
+        is_cheap = num_slabs * rows * cols * p.points.shape[1] <= _FIRST_ADDITIONS
         first = int(is_cheap.argmax()) if is_cheap.any() else len(halves) - 1
         levels, slabs = [], int(num_slabs[first])
         for k in range(first, -1, -1):
             if slabs < num_slabs[k]:
                 slabs *= 2
-            low = window[1:3] - window[4:] + halves[k]
             step, fold = _STEPS[min(k, len(_STEPS) - 1)], 2 if k == 0 else 1
+            shape, low = (int(rows[k]), int(cols[k])), window[1:3] - window[4:] + halves[k]
             levels.append(
-                _Level(float(halves[k]), step, fold, window[3] / slabs, slabs, shapes[k], low)
+                _Level(float(halves[k]), step, fold, window[3] / slabs, slabs, shape, low)
             )
         return levels
-
-    def _shape(self, half_m: float) -> tuple[int, int]:
-        """Rows and columns of cells that cover the window; the last ones stick out."""
-        cols, rows = np.ceil(self._problem.window[4:] / half_m * (1.0 + 1e-12)).astype(int)
-        return max(int(rows), 1), max(int(cols), 1)
 
     def advance(self, floor: float, is_over: Callable[[], bool] | None = None) -> bool:
         """Bound the next level around the cells above ``floor``.
@@ -157,12 +153,9 @@ class Sweep:
 
     def highest(self, count: int) -> FloatArray:
         """Boxes (K, 6) with the highest bounds, one of a tile, highest first."""
-        greatest = np.empty(len(self._sums), np.float32)
-        cells = np.empty(len(self._sums), np.int64)
-        sweep_kernels.find_greatest(self._sums, greatest, cells)
-        tiles = np.argsort(-greatest, kind="stable")[:count]
-        tiles = tiles[greatest[tiles] > -np.inf]
-        return self._boxes(tiles, cells[tiles])
+        tiles, cells = np.empty((2, count), np.int64)
+        num = sweep_kernels.find_highest(self._sums, tiles, cells)
+        return self._boxes(tiles[:num], cells[:num])
 
     def boxes(self, floor: float) -> tuple[FloatArray, FloatArray]:
         """Boxes (K, 6) above a floor and their bounds (K,), highest first."""
@@ -251,7 +244,7 @@ class Sweep:
         """The most that a field brings, slots of the layers, first cell, and the strips."""
         reach = float(np.hypot(*(term.points - self._problem.source_center).T).max())
         widest = level.step + 2.0 * min(level.delta, 2.0) * reach / (size * term.field.pitch_m)
-        layers = _layers(level.step + 1, widest + 2.0)
+        layers = _layers(level.step + 1, widest + 1.0)
         pad = int(_WIDTHS[layers[-1]])
         tables = _squares(term.field, size, unit, pad, layers)
         slots = np.full((len(_WIDTHS), len(_WIDTHS)), -1)
@@ -275,7 +268,7 @@ class Sweep:
         corner = np.abs([field.origin, field.high] - self._problem.source_center).max(axis=0)
         reach = float(np.hypot(*corner))
         widest = 1.5 * level.fold + 2.0 * min(level.delta, 2.0) * reach / (size * field.pitch_m)
-        tables = _squares(field, size, unit, 0, _layers(1, widest + 2.0))
+        tables = _squares(field, size, unit, 0, _layers(1, widest + 1.0))
         ends = []
         for axis in (1, 0):
             used = np.flatnonzero(tables[0].any(axis=1 - axis))

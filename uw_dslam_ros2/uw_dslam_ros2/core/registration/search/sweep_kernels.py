@@ -31,7 +31,7 @@ __all__ = [
     "close_tiles",
     "coarsen",
     "cut_strips",
-    "find_greatest",
+    "find_highest",
     "slide_back",
     "split_tiles",
     "widen",
@@ -98,28 +98,34 @@ def widen(table: TableArray, more_rows: int, more_cols: int, wide: TableArray) -
 def cut_strips(table: TableArray, first: int, step: int, strips: TableArray) -> None:
     """Strips (step, step, C, R, SIDE) of one table, whose rows and columns count from ``first``.
 
-    What lies outside of the table is zero.
+    What lies outside of the table is zero. Four numbers at a time are packed into one to be moved.
     """
     num_rows, num_cols = table.shape
     cols, rows = strips.shape[2], strips.shape[3]
-    plane = np.empty((rows, cols + SIDE), np.int16)
+    flat, at = strips.reshape(strips.size).view(np.uint64), 0
+    line = np.zeros(cols + 2 * SIDE, np.uint64)
+    fours = np.empty((rows, cols + SIDE), np.uint64)
+    one, two, three = np.uint64(16), np.uint64(32), np.uint64(48)
     for phase_row in range(step):
         for phase_col in range(step):
             begin = first + phase_col
             low = max(0, -(begin // step))  # the first that is not negative
             high = min(cols + SIDE, (num_cols - 1 - begin) // step + 1)
+            line[:] = 0
             for k in range(rows):
-                row = first + phase_row + k * step
-                line = plane[k]
-                line[:] = 0
+                row, four = first + phase_row + k * step, fours[k]
+                four[:] = 0
                 if 0 <= row < num_rows:
                     for j in range(low, high):
-                        line[j] = table[row, begin + j * step]
+                        line[j] = np.uint16(table[row, begin + j * step])
+                    for j in range(cols + SIDE):
+                        four[j] = (line[j] | line[j + 1] << one) | (
+                            line[j + 2] << two | line[j + 3] << three
+                        )
             for j in range(cols):
-                into = strips[phase_row, phase_col, j]
                 for k in range(rows):
-                    for x in range(SIDE):
-                        into[k, x] = plane[k, j + x]
+                    flat[at], flat[at + 1] = fours[k, j], fours[k, j + 4]
+                    at += 2
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -505,14 +511,23 @@ def close_tiles(
 
 
 @njit(cache=True, nogil=True)
-def find_greatest(sums: SumArray, greatest: SumArray, cells: IntArray) -> None:
-    """Greatest sum of each tile (K,), and its cell (K,)."""
-    for k in range(sums.shape[0]):
-        best, at = sums[k, 0], 0
-        for x in range(1, SIDE * SIDE):
-            if sums[k, x] > best:
-                best, at = sums[k, x], x
-        greatest[k], cells[k] = best, at
+def find_highest(sums: SumArray, tiles: IntArray, cells: IntArray) -> int:
+    """Tiles with the highest sums, highest first, and their cells, both (K,); their number."""
+    greatest, count = np.empty(tiles.shape[0], np.float32), 0
+    for tile in range(sums.shape[0]):
+        best, cell = np.float32(-np.inf), 0
+        for x in range(SIDE * SIDE):
+            if sums[tile, x] > best:
+                best, cell = sums[tile, x], x
+        k = min(count, tiles.shape[0] - 1)
+        if best == -np.inf or (count == tiles.shape[0] and best <= greatest[k]):
+            continue
+        while k > 0 and best > greatest[k - 1]:
+            greatest[k], tiles[k], cells[k] = greatest[k - 1], tiles[k - 1], cells[k - 1]
+            k -= 1
+        greatest[k], tiles[k], cells[k] = best, tile, cell
+        count = min(count + 1, tiles.shape[0])
+    return count
 
 
 @njit(cache=True, nogil=True)
