@@ -1,0 +1,183 @@
+"""``sensor_msgs``: PointCloud2 (echoes, perhaps each with its time) and PointCloud (Micron)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.io.drivers.adapter import Adapter, as_bytes, key_of, stamp_of
+from uw_dslam_ros2.io.drivers.laser_scan import ONE_MOMENT_S
+from uw_dslam_ros2.io.drivers.settings import ReadSettings
+from uw_dslam_ros2.io.readings import BeamsEvent, PointsEvent
+
+__all__ = ["ADAPTERS", "read_cloud", "read_old_cloud"]
+
+FloatArray = NDArray[np.float64]
+
+# By the constants of PointField.
+_POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_STAMP_FIELDS = ("t", "time", "timestamp", "time_stamp", "stamp", "time_offset", "offset_time")
+_INTENSITIES = ("intensity", "intensities")
+_MIN_BINS = 8
+
+
+def read_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | BeamsEvent]:
+    """Echoes near the horizontal plane of their frame.
+
+    With a field of times (seconds as reals, nanoseconds as integers; from the stamp, or absolute)
+    that span more than a moment, they are beams of a sonar that turns.
+    """
+    cells, fields, order = _cells(msg)
+    x, y = (_column(cells, fields, order, name) for name in ("x", "y"))
+    is_used = np.isfinite(x) & np.isfinite(y)
+    if "z" in fields:
+        z = _column(cells, fields, order, "z")
+        is_near = is_used & (np.abs(z) <= settings.point_max_height_m)
+        if is_used.any() and not is_near.any():
+            settings.tell_once(
+                Finding(
+                    "sonar_points_height",
+                    "sonar",
+                    f"all {int(is_used.sum())} points of a cloud are more than "
+                    f"{settings.point_max_height_m:g} m above or below its frame and are left "
+                    "out; check the frame's axes (z up), or set point_max_height_m",
+                )
+            )
+        is_used = is_near
+    points = np.column_stack([x, y])[is_used]
+    offset_s = _offsets(cells, fields, order, stamp_of(msg))
+    if offset_s is not None and is_used.any():
+        offset_s = offset_s[is_used]
+        if not np.isfinite(offset_s).all():
+            raise InvalidInputError("the field of times holds values that are not finite")
+        if float(np.ptp(offset_s)) >= ONE_MOMENT_S:
+            return (_beams(msg, settings, points, offset_s),)
+    return (PointsEvent(*key_of(msg, settings), points),)
+
+
+def _cells(msg: Any) -> tuple[NDArray[np.uint8], dict[str, Any], str]:
+    """Points (N, point_step) as bytes, the fields by name, the byte order."""
+    num_rows, num_cols = int(msg.height), int(msg.width)
+    point_step, row_step = int(msg.point_step), int(msg.row_step)
+    data = as_bytes(msg.data, "data")
+    if len(data) != num_rows * row_step or row_step < num_cols * point_step:
+        raise InvalidInputError(
+            f"data has {len(data)} bytes, expected height x row_step = {num_rows} x {row_step}, "
+            f"each row holding width x point_step = {num_cols} x {point_step}"
+        )
+    rows = data.reshape(num_rows, row_step)[:, : num_cols * point_step]
+    cells = np.ascontiguousarray(rows).reshape(num_rows * num_cols, point_step)
+    return cells, {f.name: f for f in msg.fields}, ">" if msg.is_bigendian else "<"
+
+
+def _column(cells: NDArray[np.uint8], fields: dict[str, Any], order: str, name: str) -> FloatArray:
+    if name not in fields or int(fields[name].datatype) not in _POINT_TYPES:
+        raise InvalidInputError(f"no field {name!r} of a known type; there are {sorted(fields)}")
+    dtype = np.dtype(order + _POINT_TYPES[int(fields[name].datatype)])
+    offset, point_step = int(fields[name].offset), cells.shape[1]
+    if offset + dtype.itemsize > point_step:
+        raise InvalidInputError(
+            f"field {name!r} at offset {offset} exceeds point_step {point_step}"
+        )
+    chunk = np.ascontiguousarray(cells[:, offset : offset + dtype.itemsize])
+    return np.asarray(chunk.view(dtype).reshape(-1), np.float64)
+
+
+def _offsets(
+    cells: NDArray[np.uint8], fields: dict[str, Any], order: str, stamp_ns: int
+) -> FloatArray | None:
+    """Time of each point after the message's stamp [s]; None without such a field."""
+    name = next((n for n in _STAMP_FIELDS if n in fields), None)
+    if name is None or len(cells) == 0:
+        return None
+    values = _column(cells, fields, order, name)
+    if int(fields[name].datatype) not in (7, 8):
+        values = values * 1e-9
+    # An absolute time is that of an epoch: no sonar turns for a day.
+    return values - stamp_ns * 1e-9 if float(np.nanmax(np.abs(values))) > 86400.0 else values
+
+
+def _beams(msg: Any, settings: ReadSettings, points: FloatArray, offset_s: FloatArray) -> Any:
+    stamps = stamp_of(msg) + np.round(offset_s * 1e9).astype(np.int64)
+    order = np.argsort(stamps, kind="stable")
+    ranges = np.hypot(points[order, 0], points[order, 1])
+    vehicle_id, _, frame_id = key_of(msg, settings)
+    return BeamsEvent(
+        vehicle_id,
+        int(stamps[order[0]]),
+        frame_id,
+        stamps[order],
+        np.arctan2(points[order, 1], points[order, 0]),
+        ranges,
+        # Nothing is said of beams without an echo; every range here is one.
+        float(np.nextafter(ranges.max(), np.inf)),
+    )
+
+
+def read_old_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | BeamsEvent]:
+    """Read a ``PointCloud``: bins of one beam or sector with a channel of intensities, or echoes.
+
+    Drivers of Tritech's Micron send one message per beam, whose points are the bins of range.
+    """
+    xyz = np.array([(p.x, p.y, p.z) for p in msg.points], dtype=np.float64).reshape(-1, 3)
+    if len(xyz) == 0:
+        return ()
+    channel = next((c for c in msg.channels if c.name in _INTENSITIES), None)
+    if channel is not None:
+        values = np.asarray(channel.values, dtype=np.float64)
+        if len(values) != len(xyz):
+            raise InvalidInputError(
+                f"channels[{channel.name}] has {len(values)} values, expected one per point "
+                f"({len(xyz)})"
+            )
+        beams = _bins(xyz, values)
+        if beams is not None:
+            bearing_rad, range_m, intensity = beams
+            stamps = np.full(len(bearing_rad), stamp_of(msg), np.int64)
+            return (
+                BeamsEvent(
+                    *key_of(msg, settings),
+                    stamps,
+                    bearing_rad,
+                    range_m,
+                    float(range_m[-1] + 0.5 * (range_m[1] - range_m[0])),
+                    intensity,
+                ),
+            )
+    is_used = np.isfinite(xyz).all(axis=1) & (np.abs(xyz[:, 2]) <= settings.point_max_height_m)
+    return (PointsEvent(*key_of(msg, settings), xyz[is_used, :2]),)
+
+
+def _bins(
+    xyz: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.generic]] | None:
+    """Bearings (B,), ranges (R,), intensities (R, B) where the points are bins; else None."""
+    if not (np.isfinite(xyz).all() and np.isfinite(values).all()):
+        return None
+    ranges = np.hypot(xyz[:, 0], xyz[:, 1])
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(ranges) <= 0.0]))
+    num_bins = len(ranges) // len(starts)
+    if num_bins < _MIN_BINS or (np.diff(np.append(starts, len(ranges))) != num_bins).any():
+        return None
+    by_beam = ranges.reshape(-1, num_bins)
+    if np.ptp(by_beam, axis=0).max() > 0.01 * by_beam[0, -1]:
+        return None
+    last = xyz.reshape(-1, num_bins, 3)[:, -1]
+    intensity = values.reshape(-1, num_bins).T
+    is_count = values.min() >= 0.0 and 1.0 < values.max() <= 255.0
+    return (
+        np.arctan2(last[:, 1], last[:, 0]),
+        by_beam[0],
+        np.round(intensity).astype(np.uint8) if is_count else intensity.astype(np.float32),
+    )
+
+
+ADAPTERS = (
+    Adapter("sensor_msgs/msg/PointCloud2", ("sonar",), read_cloud),
+    Adapter("sensor_msgs/msg/PointCloud", ("sonar",), read_old_cloud),
+)
