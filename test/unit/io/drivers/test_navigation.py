@@ -9,16 +9,15 @@ import pytest
 from unit.io.drivers.messages import STAMP_NS, header, pose, quaternion, vector
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.io.drivers import ADAPTERS, MessageConfig, ReadSettings, adapter_of
+from uw_dslam_ros2.io.drivers import ADAPTERS, ReadSettings, adapter_of
 from uw_dslam_ros2.io.readings import DepthEvent, FixEvent, PoseEvent
 
 SETTINGS = ReadSettings(vehicle_id="auv_1")
 NAN = math.nan
 
 
-def read(msgtype, msg, role="", **config):
-    settings = replace(SETTINGS, role=role, memory={}, config=MessageConfig(**config))
-    return adapter_of(msgtype).read(msg, settings)
+def read(msgtype, msg, **settings):
+    return adapter_of(msgtype).read(msg, replace(SETTINGS, memory={}, **settings))
 
 
 DVL = "marine_acoustic_msgs/msg/Dvl"
@@ -398,6 +397,13 @@ def test_acoustic_fix():
     assert (
         read("geometry_msgs/msg/PointStamped", Msg(header=header(), point=vector(NAN, 0, 0))) == ()
     )
+
+
+def test_a_wrong_setting_is_named():
+    with pytest.raises(InvalidInputError, match="data_order is 'columns'"):
+        ReadSettings(data_order="columns")
+    with pytest.raises(InvalidInputError, match="image_aperture_rad is -1"):
+        ReadSettings(image_aperture_rad=-1.0)
 
 
 def test_types_are_known_by_both_names():

@@ -9,7 +9,7 @@ import pytest
 from unit.io.drivers.messages import STAMP_NS, header, image_data, target_at, vector
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.io.drivers import MessageConfig, ReadSettings, adapter_of
+from uw_dslam_ros2.io.drivers import ReadSettings, adapter_of
 
 SETTINGS = ReadSettings(vehicle_id="auv_1")
 PORT, STARBOARD = np.radians(30.0), np.radians(-30.0)
@@ -123,7 +123,7 @@ def raw(**changes):
 
 def test_raw_image_of_a_gemini():
     name = "marine_acoustic_msgs/msg/RawSonarImage"
-    by_beam = replace(SETTINGS, config=MessageConfig(data_order="beam_major"))
+    by_beam = replace(SETTINGS, data_order="beam_major")
     (event,) = read(name, raw(), by_beam)
     assert event.forward is None
     target_at(30.0, 3.95, event)
@@ -231,8 +231,7 @@ def fan(pixels, encoding="mono8", is_bigendian=0):
     )
 
 
-GEOMETRY = MessageConfig(image_aperture_rad=np.pi / 3, image_max_range_m=4.0)
-FAN = replace(SETTINGS, config=GEOMETRY)
+FAN = replace(SETTINGS, image_aperture_rad=np.radians(60.0), image_max_range_m=4.0)
 
 
 @pytest.mark.parametrize(
@@ -249,9 +248,9 @@ def test_image_whose_geometry_is_set(encoding, dtype, is_bigendian):
 def test_image_with_the_range_from_the_bottom_and_starboard_first():
     msg = fan(one_target((4, 2), 1, 1))
     other = replace(
-        GEOMETRY, image_nearest_row="bottom", image_first_column="starboard", image_min_range_m=2.0
+        FAN, image_nearest_row="bottom", image_first_column="starboard", image_min_range_m=2.0
     )
-    (event,) = read("sensor_msgs/msg/Image", msg, replace(SETTINGS, config=other))
+    (event,) = read("sensor_msgs/msg/Image", msg, other)
     target_at(30.0, 3.25, event)
 
 
@@ -260,7 +259,7 @@ def test_an_image_without_geometry_says_what_to_set():
         read("sensor_msgs/msg/Image", fan(one_target((4, 2), 2, 0)))
     with pytest.raises(InvalidInputError, match="encoding is 'bayer_rggb8'"):
         read("sensor_msgs/msg/Image", fan(np.ones((4, 2), np.uint8), "bayer_rggb8"), FAN)
-    no_span = replace(FAN, config=replace(GEOMETRY, image_min_range_m=4.0))
+    no_span = replace(FAN, image_min_range_m=4.0)
     with pytest.raises(InvalidInputError, match="expected more than image_min_range_m"):
         read("sensor_msgs/msg/Image", fan(one_target((4, 2), 2, 0)), no_span)
     assert read("sensor_msgs/msg/Image", Msg(height=0, width=0), FAN) == ()

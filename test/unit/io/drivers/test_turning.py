@@ -8,17 +8,13 @@ import pytest
 from unit.io.drivers.messages import STAMP_NS, header
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.io.drivers import MessageConfig, ReadSettings, adapter_of
+from uw_dslam_ros2.io.drivers import ReadSettings, adapter_of
 from uw_dslam_ros2.io.interfaces import make_typestore
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.readings import BeamsEvent, PointsEvent, ScanEvent
 
 SETTINGS = ReadSettings(vehicle_id="auv_1")
 SECOND = 1_000_000_000
-
-
-def with_config(**values):
-    return replace(SETTINGS, config=MessageConfig(**values))
 
 
 def read(msgtype, msg, settings=SETTINGS):
@@ -54,7 +50,7 @@ def test_angles_of_a_ping360_wrap_and_have_a_unit():
     name = "ping360_sonar_msgs/msg/SonarEcho"
     (event,) = read(name, echo(angle=3.5))
     assert event.bearing_rad[0] == pytest.approx(3.5 - 2.0 * np.pi)
-    (event,) = read(name, echo(angle=100.0), with_config(sonar_angle_unit="gradian"))
+    (event,) = read(name, echo(angle=100.0), replace(SETTINGS, sonar_angle_unit="gradian"))
     assert np.degrees(event.bearing_rad[0]) == pytest.approx(90.0)
     with pytest.raises(InvalidInputError, match=r"angle is 100.0 radian.* sonar_angle_unit"):
         read(name, echo(angle=100.0))
@@ -105,7 +101,7 @@ def test_a_turn_is_spread_over_its_scan_time():
     (event,) = read(LASER, turn)
     assert (event.beam_stamp_ns - STAMP_NS).tolist() == [2 * i * SECOND for i in range(8)]
     # A driver that stamps the end, turns the other way, and says nothing of the time.
-    settings = with_config(scan_period_s=8.0, scan_stamp="last")
+    settings = replace(SETTINGS, scan_period_s=8.0, scan_stamp="last")
     (event,) = read(LASER, scan(ranges, angle_increment=-np.pi / 4), settings)
     assert (event.beam_stamp_ns - STAMP_NS).tolist() == [(i - 7) * SECOND for i in range(8)]
     assert event.stamp_ns == STAMP_NS - 7 * SECOND
@@ -178,7 +174,7 @@ def test_the_sea_bed_is_no_wall(is_bigendian):
     (event,) = read(CLOUD, cloud(XYZ, rows, is_bigendian))
     assert isinstance(event, PointsEvent)
     assert event.points.tolist() == [[4.0, 3.0], [1.0, -2.0]]
-    (event,) = read(CLOUD, cloud(XYZ, rows), with_config(point_max_height_m=5.0))
+    (event,) = read(CLOUD, cloud(XYZ, rows), replace(SETTINGS, point_max_height_m=5.0))
     assert len(event.points) == 3
 
 

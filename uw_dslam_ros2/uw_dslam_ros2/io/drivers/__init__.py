@@ -15,9 +15,9 @@ from uw_dslam_ros2.io.drivers import (
     twist,
 )
 from uw_dslam_ros2.io.drivers.adapter import Adapter, stamp_of
-from uw_dslam_ros2.io.drivers.settings import MessageConfig, ReadSettings
+from uw_dslam_ros2.io.drivers.settings import ReadSettings
 
-__all__ = ["ADAPTERS", "Adapter", "MessageConfig", "ReadSettings", "adapter_of", "stamp_of"]
+__all__ = ["ADAPTERS", "Adapter", "ReadSettings", "adapter_of", "stamp_of"]
 
 _FAMILIES = (
     projected_image, oculus, ping360, laser_scan, point_cloud, image,

@@ -41,33 +41,33 @@ def _check_geometry(settings: ReadSettings) -> None:
             ("image_aperture_rad", "horizontal opening of the fan"),
             ("image_max_range_m", "range of its last row"),
         )
-        if getattr(settings.config, name) <= 0.0
+        if getattr(settings, name) <= 0.0
     ]
     if missing:
         raise InvalidInputError(
             "an image does not say which bearing and range its pixels have: set "
             f"{' and '.join(missing)}"
         )
-    if settings.config.image_max_range_m <= settings.config.image_min_range_m:
+    if settings.image_max_range_m <= settings.image_min_range_m:
         raise InvalidInputError(
-            f"image_max_range_m is {settings.config.image_max_range_m}, expected more than "
-            f"image_min_range_m = {settings.config.image_min_range_m}"
+            f"image_max_range_m is {settings.image_max_range_m}, expected more than "
+            f"image_min_range_m = {settings.image_min_range_m}"
         )
 
 
 def _fan(msg: Any, pixels: NDArray[Any], settings: ReadSettings) -> ImageEvent:
     num_ranges, num_beams = pixels.shape
-    if settings.config.image_nearest_row == "bottom":
+    if settings.image_nearest_row == "bottom":
         pixels = pixels[::-1]
-    span_m = settings.config.image_max_range_m - settings.config.image_min_range_m
+    span_m = settings.image_max_range_m - settings.image_min_range_m
     range_m = (
-        settings.config.image_min_range_m
+        settings.image_min_range_m
         + (np.arange(num_ranges, dtype=np.float64) + 0.5) * span_m / num_ranges
     )
     # The outermost beams look along the edges of the fan.
-    half_rad = 0.5 * settings.config.image_aperture_rad
+    half_rad = 0.5 * settings.image_aperture_rad
     bearing_rad = np.linspace(half_rad, -half_rad, num_beams)
-    if settings.config.image_first_column == "starboard":
+    if settings.image_first_column == "starboard":
         bearing_rad = -bearing_rad
     image = SonarImage(stamp_of(msg), amplitudes(pixels, settings), range_m, bearing_rad)
     return ImageEvent(*key_of(msg, settings), image, None)

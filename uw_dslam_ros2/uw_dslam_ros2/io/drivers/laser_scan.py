@@ -68,14 +68,14 @@ def _offsets(msg: Any, settings: ReadSettings, num_rays: int) -> FloatArray:
         raise InvalidInputError(
             f"time_increment, scan_time are {(increment_s, period_s)}, expected finite numbers"
         )
-    if settings.config.scan_period_s > 0.0:
-        increment_s = settings.config.scan_period_s / num_rays
+    if settings.scan_period_s > 0.0:
+        increment_s = settings.scan_period_s / num_rays
     elif increment_s == 0.0 and _is_turn(msg, num_rays):
         # A fan of one moment also has a scan_time, the time to the next one: only a turn is
         # spread over it.
         increment_s = period_s / num_rays
     offsets = increment_s * np.arange(num_rays, dtype=np.float64)
-    return offsets - offsets[-1] if settings.config.scan_stamp == "last" else offsets
+    return offsets - offsets[-1] if settings.scan_stamp == "last" else offsets
 
 
 def _is_turn(msg: Any, num_rays: int) -> bool:

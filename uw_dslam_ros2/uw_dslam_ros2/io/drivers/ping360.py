@@ -27,10 +27,10 @@ def read_echo(msg: Any, settings: ReadSettings) -> Sequence[BeamsEvent]:
     if len(intensity) == 0:
         return ()
     angle, range_max_m = float(msg.angle), float(msg.range)
-    bearing_rad = angle * _RAD_PER[settings.config.sonar_angle_unit]
+    bearing_rad = angle * _RAD_PER[settings.sonar_angle_unit]
     if not (math.isfinite(angle) and abs(bearing_rad) < 2.0 * math.pi + 0.1):
         raise InvalidInputError(
-            f"angle is {angle} {settings.config.sonar_angle_unit}, expected at most a turn; "
+            f"angle is {angle} {settings.sonar_angle_unit}, expected at most a turn; "
             "set sonar_angle_unit to gradian or degree if the driver has those"
         )
     if range_max_m <= 0.0:

@@ -37,15 +37,15 @@ def read_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | Beams
     is_used = np.isfinite(x) & np.isfinite(y)
     if "z" in fields:
         z = _column(cells, fields, order, "z")
-        is_near = is_used & (np.abs(z) <= settings.config.point_max_height_m)
+        is_near = is_used & (np.abs(z) <= settings.point_max_height_m)
         if is_used.any() and not is_near.any():
             settings.tell_once(
                 Finding(
                     "sonar_points_height",
                     "sonar",
                     f"all {int(is_used.sum())} points of a cloud are more than "
-                    f"{settings.config.point_max_height_m:g} m above or below its frame and are "
-                    "left out; check the frame's axes (z up), or set point_max_height_m",
+                    f"{settings.point_max_height_m:g} m above or below its frame and are left "
+                    "out; check the frame's axes (z up), or set point_max_height_m",
                 )
             )
         is_used = is_near
@@ -149,9 +149,7 @@ def read_old_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | B
                     intensity,
                 ),
             )
-    is_used = np.isfinite(xyz).all(axis=1) & (
-        np.abs(xyz[:, 2]) <= settings.config.point_max_height_m
-    )
+    is_used = np.isfinite(xyz).all(axis=1) & (np.abs(xyz[:, 2]) <= settings.point_max_height_m)
     return (PointsEvent(*key_of(msg, settings), xyz[is_used, :2]),)
 
 

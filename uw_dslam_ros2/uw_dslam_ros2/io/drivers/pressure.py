@@ -30,7 +30,7 @@ def read_pressure(msg: Any, settings: ReadSettings) -> Sequence[DepthEvent]:
     if not math.isfinite(pressure):
         raise InvalidInputError(f"fluid_pressure is {pressure}, expected a finite number of Pa")
     scale, offset_pa = _convention(pressure, settings)
-    depth_m = depth_of_pressure(pressure * scale + offset_pa, settings.config.water_density_kg_m3)
+    depth_m = depth_of_pressure(pressure * scale + offset_pa, settings.water_density_kg_m3)
     return (DepthEvent(*key_of(msg, settings), depth_m),)
 
 
@@ -41,8 +41,8 @@ def depth_of_pressure(pressure_pa: float, water_density_kg_m3: float) -> float:
 
 def _convention(pressure: float, settings: ReadSettings) -> tuple[float, float]:
     """``(Pa per unit, Pa to add)`` of a topic, decided by its first message."""
-    if settings.config.pressure != "auto":
-        return 1.0, _ATMOSPHERE_PA if settings.config.pressure == "gauge" else 0.0
+    if settings.pressure != "auto":
+        return 1.0, _ATMOSPHERE_PA if settings.pressure == "gauge" else 0.0
     if "pressure" not in settings.memory:
         if pressure >= _LEAST_ABSOLUTE_PA:
             settings.memory["pressure"] = (1.0, 0.0)

@@ -93,7 +93,7 @@ def _image_event(
         raise InvalidInputError(f"image.dtype is {code}, expected 0 to {len(_PIXEL_TYPES) - 1}")
     dtype = np.dtype((">" if msg.image.is_bigendian else "<") + _PIXEL_TYPES[code])
     shape = (len(range_m), len(bearing_rad))
-    if settings.config.data_order == "range_major":
+    if settings.data_order == "range_major":
         pixels = pixels_of(msg.image.data, dtype, shape, "image.data")
     else:
         pixels = pixels_of(msg.image.data, dtype, shape[::-1], "image.data").T
