@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import DataError
-from uw_dslam_ros2.core.mounting import StaticFrames, planar_mount
+from uw_dslam_ros2.core.mounting import StaticFrames, fan_mount
 from uw_dslam_ros2.io.bags import ImageEvent, ImuEvent, TransformEvent, TruthEvent, read_events
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.trajectories import read_tum
@@ -77,10 +77,12 @@ def test_mounts_in_the_bag_are_those_of_the_simulation(tiny):
         if isinstance(event, TransformEvent):
             frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
     base = "auv_1/base_link"
-    sonar = planar_mount(frames.lookup(base, "auv_1/sonar"), "z")
-    assert sonar.as_array() == pytest.approx(T_BASE_SONAR.as_array())
-    dvl = planar_mount(frames.lookup(base, "auv_1/dvl"), "x")
-    assert dvl.as_array() == pytest.approx(T_BASE_DVL.as_array())
+    sonar = fan_mount(frames.lookup(base, "auv_1/sonar"), "z")
+    assert sonar.T_base_fan.as_array() == pytest.approx(T_BASE_SONAR.as_array())
+    assert sonar.projection is None
+    dvl = frames.lookup(base, "auv_1/dvl")
+    assert dvl[:2, 3] == pytest.approx(T_BASE_DVL.as_array()[:2])
+    np.testing.assert_allclose(dvl[:3, 2], [0.0, 0.0, -1.0], atol=1e-12)
 
 
 def test_bright_pixels_lie_on_true_walls_when_placed_by_the_truth(tiny):

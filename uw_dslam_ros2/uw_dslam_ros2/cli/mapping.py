@@ -16,12 +16,11 @@ from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.vehicle_mapper import VehicleMapper
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest
-from uw_dslam_ros2.core.mounting import StaticFrames
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.bags import TransformEvent, TruthEvent, open_bag, read_events
-from uw_dslam_ros2.io.feeding import feed, in_stamp_order
+from uw_dslam_ros2.io.feeding import Mountings, feed, in_stamp_order
 from uw_dslam_ros2.io.settings import SettingsFile
 
 __all__ = ["OfflineConfig", "VehicleSubmaps", "map_bag", "map_bags", "settle", "vehicle_of_bag"]
@@ -145,20 +144,19 @@ def _count(number: int) -> None:
 def map_bag(bag: Path, vehicle_id: str, config: VehicleMapperConfig) -> VehicleSubmaps:
     """Map one vehicle's bag; `DataError` where it cannot be read."""
     mapper = VehicleMapper(config, vehicle_id)
-    frames = StaticFrames()
-    base_frame = f"{vehicle_id}/base_link"
+    mountings = Mountings(f"{vehicle_id}/base_link")
     newest: dict[int, Submap] = {}
     number = 0
     for number, event in enumerate(in_stamp_order(read_events(bag)), start=1):
         if number % 200 == 0:
             _count(200)
         if isinstance(event, TransformEvent):
-            frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
+            mountings.add(event)
             continue
         if isinstance(event, TruthEvent):
             continue
         try:
-            submaps = feed(mapper, event, frames.lookup(base_frame, event.frame_id))
+            submaps = feed(mapper, event, mountings.of(event))
         except InvalidInputError as error:
             raise DataError(f"{bag}: {type(event).__name__}: {error}") from error
         newest |= {submap.sequence: submap for submap in submaps}

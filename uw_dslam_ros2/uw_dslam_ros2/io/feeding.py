@@ -9,20 +9,32 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.mapping import VehicleMapper
-from uw_dslam_ros2.core.mounting import planar_mount
+from uw_dslam_ros2.core.mounting import (
+    StaticFrames,
+    fan_mount,
+    level_rotation,
+    rotation_of_quaternion,
+)
+from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
+    FixEvent,
     ImageEvent,
     ImuEvent,
     PointsEvent,
+    PoseEvent,
     Reading,
     ScanEvent,
+    TransformEvent,
     VelocityEvent,
 )
 
-__all__ = ["SensorEvent", "feed", "in_stamp_order"]
+__all__ = ["Mountings", "SensorEvent", "feed", "in_stamp_order", "role_of", "usual_mounting"]
+
+FloatArray = NDArray[np.float64]
 
 SensorEvent = Reading
 
@@ -33,54 +45,186 @@ _HOLD_NS = 2_000_000_000
 def in_stamp_order[EventT](events: Iterable[EventT]) -> Iterator[EventT]:
     """Bring a recording's messages, up to 2 s out of order, into that of their stamps.
 
-    Of equal stamps the pings come last. What is no sensor's message is passed on at once.
+    Of equal stamps the attitude comes first, since others are levelled by it, and pings last. What
+    is no sensor's message is passed on at once.
     """
-    waiting: list[tuple[int, bool, int, EventT]] = []
+    waiting: list[tuple[int, int, int, EventT]] = []
     newest_ns = 0
     for number, event in enumerate(events):
         if not isinstance(event, SensorEvent):
             yield event
             continue
         newest_ns = max(newest_ns, event.stamp_ns)
-        heapq.heappush(waiting, (event.stamp_ns, isinstance(event, _PINGS), number, event))
+        heapq.heappush(waiting, (event.stamp_ns, _rank(event), number, event))
         while waiting[0][0] < newest_ns - _HOLD_NS:
             yield heapq.heappop(waiting)[-1]
     while waiting:
         yield heapq.heappop(waiting)[-1]
 
 
-def feed(
-    mapper: VehicleMapper, event: SensorEvent, T_base_sensor: NDArray[np.float64]
-) -> list[Submap]:
+def _rank(event: SensorEvent) -> int:
+    return 0 if isinstance(event, ImuEvent) else 1 + isinstance(event, _PINGS)
+
+
+class Mountings:
+    """Where the instruments of a vehicle sit, as transforms tell it.
+
+    Parameters
+    ----------
+    base_frame_id
+        Frame of the vehicle's body.
+
+    Attributes
+    ----------
+    unknown : dict[str, str]
+        Frames that no transform leads from to the body -> kind of reading. They are taken to sit
+        at its origin, with the axes that their message's definition says.
+    """
+
+    def __init__(self, base_frame_id: str) -> None:
+        self._base_frame_id = base_frame_id
+        self._frames = StaticFrames()
+        self._known: dict[tuple[type, str], FloatArray] = {}
+        self.unknown: dict[str, str] = {}
+
+    def add(self, event: TransformEvent) -> None:
+        """Take a transform."""
+        self._frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
+        self._known.clear()
+        self.unknown.clear()
+
+    def of(self, event: Reading) -> FloatArray:
+        """``T_base_sensor`` (4, 4) of the instrument that said this."""
+        frame_id = event.child_frame_id if isinstance(event, PoseEvent) else event.frame_id
+        key = type(event), frame_id
+        if key not in self._known:
+            self._known[key] = self._mounting(event, frame_id)
+        return self._known[key]
+
+    def _mounting(self, event: Reading, frame_id: str) -> FloatArray:
+        if frame_id.strip("/") in ("", self._base_frame_id.strip("/")):
+            return np.eye(4)
+        try:
+            return self._frames.lookup(self._base_frame_id, frame_id)
+        except InvalidInputError:
+            if not isinstance(event, DepthEvent | PoseEvent | FixEvent):
+                self.unknown[frame_id] = role_of(event)
+            return usual_mounting(event)
+
+
+def role_of(reading: Reading) -> str:
+    """What the instrument is to a mapper: sonar, dvl, imu, depth, odometry or fix."""
+    match reading:
+        case VelocityEvent():
+            return "dvl"
+        case ImuEvent():
+            return "imu"
+        case DepthEvent():
+            return "depth"
+        case PoseEvent():
+            return "odometry"
+        case FixEvent():
+            return "fix"
+    return "sonar"
+
+
+def usual_mounting(event: Reading) -> FloatArray:
+    """``T_base_sensor`` (4, 4) of an instrument at the origin that looks ahead, level, upright."""
+    columns = np.eye(4)
+    match event:
+        case VelocityEvent(is_z_down=True):
+            columns[:3, :3] = np.diag([1.0, -1.0, -1.0])
+        case ImageEvent(forward="z"):
+            columns[:3, :3] = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]
+    return columns
+
+
+def feed(mapper: VehicleMapper, event: SensorEvent, T_base_sensor: FloatArray) -> list[Submap]:
     """Give one event to a mapper; return the submaps that it made or changed.
+
+    Rotations are used whole: what an instrument says in its own axes is turned to base_link by
+    its mounting, and to the level plane by roll and pitch where an attitude was measured.
 
     Raises
     ------
     InvalidInputError
-        If the instrument's forward axis points up or down, so that it has no place in the plane.
+        If a sonar's fan points up or down, so that it has no place in the plane.
     """
     stamp_ns = event.stamp_ns
+    R_level_base = mapper.attitude_at(stamp_ns)
     match event:
         case ImageEvent():
-            return mapper.add_image(event.image, planar_mount(T_base_sensor, "z"))
+            mount = fan_mount(T_base_sensor, event.forward, R_level_base)
+            return mapper.add_image(event.image, mount.T_base_fan, mount.projection)
         case ScanEvent():
-            mount = planar_mount(T_base_sensor)
+            mount = fan_mount(T_base_sensor, "x", R_level_base)
             return mapper.add_scan(
-                stamp_ns, event.angles_rad, event.ranges_m, event.range_max_m, mount
-            )
+                stamp_ns, event.angles_rad, event.ranges_m, event.range_max_m,
+                mount.T_base_fan, mount.projection,
+            )  # fmt: skip
         case PointsEvent():
-            return mapper.add_points(stamp_ns, event.points, planar_mount(T_base_sensor))
+            return _feed_points(mapper, event, T_base_sensor, R_level_base)
         case VelocityEvent():
-            mount = planar_mount(T_base_sensor)
-            mapper.add_velocity(stamp_ns, *event.horizontal(), mount)
+            _feed_velocity(mapper, event, T_base_sensor, R_level_base)
         case ImuEvent():
-            _feed_imu(mapper, event, planar_mount(T_base_sensor).yaw)
+            _feed_imu(mapper, event, T_base_sensor[:3, :3])
+        case PoseEvent():
+            T_base_child = _seen_from_above(T_base_sensor)
+            mapper.add_pose(stamp_ns, event.T_frame_base @ T_base_child.inverse())
         case DepthEvent():
             mapper.add_depth(stamp_ns, event.depth_m)
     return []
 
 
-def _feed_imu(mapper: VehicleMapper, event: ImuEvent, mount_yaw_rad: float) -> None:
-    yaw_rad = None if event.yaw_rad is None else event.yaw_rad - mount_yaw_rad
+def _seen_from_above(T_base_sensor: FloatArray) -> SE2:
+    yaw = math.atan2(T_base_sensor[1, 0], T_base_sensor[0, 0])
+    return SE2(float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3]), yaw)
+
+
+def _feed_points(
+    mapper: VehicleMapper,
+    event: PointsEvent,
+    T_base_sensor: FloatArray,
+    R_level_base: FloatArray | None,
+) -> list[Submap]:
+    """Points of the fan (N, 2), or of space (N, 3): these need no fan that is level."""
+    if event.points.shape[1] == 2:
+        mount = fan_mount(T_base_sensor, "x", R_level_base)
+        return mapper.add_points(event.stamp_ns, event.points, mount.T_base_fan, mount.projection)
+    T_level_sensor = T_base_sensor.copy()
+    if R_level_base is not None:
+        T_level_sensor[:3] = R_level_base @ T_level_sensor[:3]
+    points = event.points @ T_level_sensor[:3, :3].T
+    T_base_points = SE2(float(T_level_sensor[0, 3]), float(T_level_sensor[1, 3]), 0.0)
+    return mapper.add_points(event.stamp_ns, points[:, :2], T_base_points)
+
+
+def _feed_velocity(
+    mapper: VehicleMapper,
+    event: VelocityEvent,
+    T_base_sensor: FloatArray,
+    R_level_base: FloatArray | None,
+) -> None:
+    rotation = T_base_sensor[:3, :3]
+    if R_level_base is not None:
+        rotation = R_level_base @ rotation
+    covariance = event.covariance
+    if covariance is not None:
+        covariance = (rotation @ covariance @ rotation.T)[:2, :2]
+    place = SE2(float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3]), 0.0)
+    mapper.add_velocity(event.stamp_ns, (rotation @ event.velocity_m_s)[:2], covariance, place)
+
+
+def _feed_imu(mapper: VehicleMapper, event: ImuEvent, R_base_imu: FloatArray) -> None:
     sigma_rad = None if event.yaw_variance is None else math.sqrt(event.yaw_variance)
-    mapper.add_imu(event.stamp_ns, yaw_rad, event.yaw_rate_rad_s, sigma_rad)
+    rates, yaw_rad = event.angular_velocity_rad_s, None
+    turned = None if rates is None else R_base_imu @ rates
+    if event.orientation_xyzw is not None:
+        R_world_base = rotation_of_quaternion(event.orientation_xyzw) @ R_base_imu.T
+        yaw_rad = math.atan2(R_world_base[1, 0], R_world_base[0, 0])
+        R_level_base = level_rotation(R_world_base)
+        mapper.add_attitude(event.stamp_ns, R_level_base)
+        if turned is not None and R_level_base is not None:
+            turned = R_level_base @ turned
+    rate_rad_s = None if turned is None else float(turned[2])
+    mapper.add_imu(event.stamp_ns, yaw_rad, rate_rad_s, sigma_rad)

@@ -40,10 +40,9 @@ from uw_dslam_ros2.core.metrics import (
     interpolate_poses,
     trajectory_error,
 )
-from uw_dslam_ros2.core.mounting import StaticFrames
 from uw_dslam_ros2.io.bags import TransformEvent, TruthEvent, read_events
 from uw_dslam_ros2.io.datasets.aracati2017 import SEGMENTS, read_aracati2017, write_bag
-from uw_dslam_ros2.io.feeding import feed, in_stamp_order
+from uw_dslam_ros2.io.feeding import Mountings, feed, in_stamp_order
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.trajectories import read_tum
@@ -172,13 +171,13 @@ def _cases(args: argparse.Namespace, work: Path) -> Iterator[_Case]:
 
 def _map(case: _Case, estimator: str) -> _Mapped:
     mapper = VehicleMapper(replace(case.config, estimator=estimator), "auv_1")
-    frames = StaticFrames()
+    mountings = Mountings("auv_1/base_link")
     start = time.process_time()
     for event in in_stamp_order(read_events(case.bag)):
         if isinstance(event, TransformEvent):
-            frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
+            mountings.add(event)
         elif not isinstance(event, TruthEvent):
-            feed(mapper, event, frames.lookup("auv_1/base_link", event.frame_id))
+            feed(mapper, event, mountings.of(event))
     mapper.finish()
     seconds = time.process_time() - start
     trajectory = mapper.trajectory()

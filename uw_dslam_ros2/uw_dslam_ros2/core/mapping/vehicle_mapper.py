@@ -16,6 +16,7 @@ from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.mosaic import Mosaic
 from uw_dslam_ros2.core.navigation import NavigationFilter
+from uw_dslam_ros2.core.navigation.pose_differences import PoseDifferences
 from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
@@ -32,6 +33,8 @@ __all__ = ["VehicleMapper"]
 FloatArray = NDArray[np.float64]
 _REISSUE_M, _REISSUE_RAD = 0.02, 0.002
 """A submap that moved by more is given away again."""
+_ATTITUDE_NS = 500_000_000
+"""A vehicle rolls and pitches within seconds: older angles are not used."""
 _MIN_OVERLAP = 0.3
 """Least share of a ping's echoes that must meet known ones for a match to be believed."""
 
@@ -63,6 +66,8 @@ class VehicleMapper:
             "num_detections_last": 0, "match_overlap_last": math.nan, "depth_m": math.nan,
         }  # fmt: skip
         self._velocity_ns: int | None = None
+        self._pose_differences = PoseDifferences()
+        self._attitude: tuple[int, FloatArray | None] = (0, None)
 
     # --- navigation in
     # -------------------------------------------------------------------------------------------
@@ -95,6 +100,21 @@ class VehicleMapper:
         if np.isfinite(np.asarray(v_body_m_s, dtype=np.float64)).all():
             self._velocity_ns = max(stamp_ns, self._velocity_ns or stamp_ns)
 
+    def add_pose(self, stamp_ns: int, T_frame_base: SE2) -> None:
+        """Pose that the vehicle's own filter gives; only the motion between poses is used."""
+        self._navigation.add_yaw(stamp_ns, T_frame_base.yaw)
+        if (difference := self._pose_differences.add(stamp_ns, T_frame_base)) is not None:
+            self.add_velocity(*difference)
+
+    def add_attitude(self, stamp_ns: int, R_level_base: FloatArray | None) -> None:
+        """Roll and pitch (3, 3), from base_link to the level frame of the same yaw."""
+        self._attitude = (stamp_ns, R_level_base)
+
+    def attitude_at(self, stamp_ns: int) -> FloatArray | None:
+        """Roll and pitch (3, 3) as last measured; None where that is not known or long ago."""
+        measured_ns, R_level_base = self._attitude
+        return R_level_base if abs(stamp_ns - measured_ns) <= _ATTITUDE_NS else None
+
     def add_depth(self, stamp_ns: int, depth_m: float) -> None:  # noqa: ARG002 (one form for all inputs)
         """Depth below the surface [m], positive down.
 
@@ -106,9 +126,15 @@ class VehicleMapper:
     # --- sonar in
     # ----------------
 
-    def add_image(self, image: SonarImage, T_base_sonar: SE2) -> list[Submap]:
-        """A sonar image; returns submaps that closed, or whose pose has moved, by now."""
-        return self._add(detect(image, self._config.sonar), T_base_sonar)
+    def add_image(
+        self, image: SonarImage, T_base_sonar: SE2, projection: FloatArray | None = None
+    ) -> list[Submap]:
+        """A sonar image; returns submaps that closed, or whose pose has moved, by now.
+
+        ``projection`` (2, 2) takes points of a fan that is not level to the plane, before
+        ``T_base_sonar``: see `core.mounting.FanMount`.
+        """
+        return self._add(detect(image, self._config.sonar), T_base_sonar, projection)
 
     def add_scan(
         self,
@@ -117,18 +143,24 @@ class VehicleMapper:
         ranges_m: ArrayLike,
         range_max_m: float,
         T_base_sonar: SE2,
+        projection: FloatArray | None = None,
     ) -> list[Submap]:
         """A scan: angles (B,), ranges (B,), infinity where a beam met nothing."""
         found = detections_from_scan(
             stamp_ns, angles_rad, ranges_m, range_max_m, self._config.sonar
         )
-        return self._add(found, T_base_sonar)
+        return self._add(found, T_base_sonar, projection)
 
-    def add_points(self, stamp_ns: int, points: ArrayLike, T_base_sonar: SE2) -> list[Submap]:
+    def add_points(
+        self,
+        stamp_ns: int,
+        points: ArrayLike,
+        T_base_sonar: SE2,
+        projection: FloatArray | None = None,
+    ) -> list[Submap]:
         """Detections (N, 2) [m] that somebody else made, in the sonar's frame."""
-        return self._add(
-            detections_from_points(stamp_ns, points, self._config.sonar), T_base_sonar
-        )
+        found = detections_from_points(stamp_ns, points, self._config.sonar)
+        return self._add(found, T_base_sonar, projection)
 
     def finish(self) -> list[Submap]:
         """Close the open submap, and settle the graph; no ping may follow."""
@@ -246,7 +278,11 @@ class VehicleMapper:
     # --- inside
     # ----------------
 
-    def _add(self, detections: Detections, T_base_sonar: SE2) -> list[Submap]:
+    def _add(
+        self, detections: Detections, T_base_sonar: SE2, projection: FloatArray | None = None
+    ) -> list[Submap]:
+        if projection is not None:
+            detections = detections.projected(projection)
         is_old = self._last_ping_ns is not None and detections.stamp_ns <= self._last_ping_ns
         if is_old or not self._navigation.is_started:
             self._count("num_pings_dropped")

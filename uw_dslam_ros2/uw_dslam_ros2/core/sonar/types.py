@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,3 +53,14 @@ class Detections:
     free_range_m: FloatArray
     beamwidth_rad: float
     range_sigma_m: float
+
+    def projected(self, projection: FloatArray) -> Detections:
+        """The same seen from above: ``projection`` (2, 2) takes points of the fan to the plane."""
+        ahead = np.stack([np.cos(self.bearing_rad), np.sin(self.bearing_rad)], axis=1)
+        seen = ahead @ projection.T
+        return replace(
+            self,
+            points=self.points @ projection.T,
+            bearing_rad=np.arctan2(seen[:, 1], seen[:, 0]),
+            free_range_m=self.free_range_m * np.hypot(seen[:, 0], seen[:, 1]),
+        )
