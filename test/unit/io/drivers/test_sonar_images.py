@@ -311,3 +311,33 @@ def test_an_image_that_cannot_tell_is_left_alone(rng, scale):
     (event,) = read("sensor_msgs/msg/Image", fan(pixels, "mono16"), settings)
     np.testing.assert_array_equal(event.image.intensity, pixels)
     assert "is_swapped" not in settings.memory
+
+
+def wall_in_speckle(rng, num_ranges, num_beams):
+    rows = np.arange(num_ranges)[:, None] - 0.5 * num_ranges - 0.1 * np.arange(num_beams)
+    clean = 150.0 * np.exp(-0.5 * (rows / 4.0) ** 2) + 40.0
+    return (clean * np.sqrt(rng.exponential(1.0, clean.shape))).clip(0.0, 255.0).astype(np.uint8)
+
+
+@pytest.mark.parametrize("shape", [(200, 96), (96, 200), (128, 64)])
+@pytest.mark.parametrize("is_by_beam", [False, True])
+def test_the_order_of_the_bytes_is_found(rng, shape, is_by_beam):
+    settings = replace(SETTINGS, memory={})
+    bearings = np.linspace(1.0, -1.0, shape[1])
+    directions = [(0.0, -np.sin(b), np.cos(b)) for b in bearings]
+    for _ in range(12):
+        pixels = wall_in_speckle(rng, *shape)
+        msg = projected(directions, pixels)
+        if is_by_beam:
+            msg.image.data = np.ascontiguousarray(pixels.T).reshape(-1)
+        (event,) = read("marine_acoustic_msgs/msg/ProjectedSonarImage", msg, settings)
+        np.testing.assert_array_equal(event.image.intensity, pixels)
+    assert settings.memory["data_order"] == ("beam_major" if is_by_beam else "range_major")
+
+
+def test_black_images_do_not_tell_the_order():
+    settings = replace(SETTINGS, memory={})
+    msg = projected(X_FORWARD, np.zeros((4, 2), np.uint8))
+    for _ in range(12):
+        read("marine_acoustic_msgs/msg/ProjectedSonarImage", msg, settings)
+    assert settings.memory == {}

@@ -20,6 +20,8 @@ __all__ = ["ADAPTERS", "read_projected", "read_raw"]
 
 # By the constants of SonarImageData.
 _PIXEL_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+_NUM_IMAGES = 10  # that are asked for the order of their bytes
+_CLEARLY = 0.3
 
 
 def read_projected(msg: Any, settings: ReadSettings) -> Sequence[ImageEvent]:
@@ -93,12 +95,44 @@ def _image_event(
         raise InvalidInputError(f"image.dtype is {code}, expected 0 to {len(_PIXEL_TYPES) - 1}")
     dtype = np.dtype((">" if msg.image.is_bigendian else "<") + _PIXEL_TYPES[code])
     shape = (len(range_m), len(bearing_rad))
-    if settings.data_order == "range_major":
-        pixels = pixels_of(msg.image.data, dtype, shape, "image.data")
-    else:
-        pixels = pixels_of(msg.image.data, dtype, shape[::-1], "image.data").T
+    pixels = pixels_of(msg.image.data, dtype, shape, "image.data")
+    if _order_of(pixels, settings) == "beam_major":
+        pixels = pixels.reshape(shape[::-1]).T
     image = SonarImage(stamp_of(msg), amplitudes(pixels, settings), range_m, bearing_rad)
     return ImageEvent(*key_of(msg, settings), image, forward)
+
+
+def _order_of(pixels: NDArray[Any], settings: ReadSettings) -> str:
+    """Slowest index of the bytes: as set, or as the first images that say something have it.
+
+    Next to a pixel along the slow index lies its neighbour, one whole beam or range further in
+    the bytes; at the distance that the other order would have lies a stranger.
+    """
+    if settings.data_order != "auto":
+        return settings.data_order
+    if "data_order" in settings.memory:
+        return str(settings.memory["data_order"])
+    num_ranges, num_beams = pixels.shape
+    if num_ranges == num_beams or min(pixels.shape) < 2:
+        return "range_major"
+    flat = pixels.reshape(-1).astype(np.float64)
+    flat[~np.isfinite(flat)] = 0.0
+    flat -= flat.mean()
+    power = float(flat @ flat)
+    if power > 0.0:
+        sums = settings.memory.setdefault("data_order_sums", [0, 0.0])
+        sums[0] += 1
+        sums[1] += _alike(flat, num_beams, power) - _alike(flat, num_ranges, power)
+        if sums[0] >= _NUM_IMAGES:
+            is_by_beam = sums[1] / sums[0] < -_CLEARLY
+            settings.memory["data_order"] = "beam_major" if is_by_beam else "range_major"
+        return "beam_major" if sums[1] / sums[0] < -_CLEARLY else "range_major"
+    return "range_major"
+
+
+def _alike(flat: NDArray[np.float64], step: int, power: float) -> float:
+    """Correlation of pixels that lie a step apart."""
+    return float(flat[step:] @ flat[:-step]) / power
 
 
 ADAPTERS = tuple(

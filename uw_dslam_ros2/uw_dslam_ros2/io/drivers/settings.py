@@ -12,7 +12,7 @@ from uw_dslam_ros2.core.findings import Finding
 
 __all__ = ["CHOICES", "DATA_ORDERS", "ReadSettings"]
 
-DATA_ORDERS = ("range_major", "beam_major")
+DATA_ORDERS = ("auto", "range_major", "beam_major")
 """The slowest index of a sonar image's bytes: range (index = range * beams + beam), or beam."""
 
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -38,7 +38,8 @@ class ReadSettings:
     ----------
     vehicle_id : whose the readings are.
     role : what the topic is used for, one of its adapter's roles; "" is the first of them.
-    data_order : slowest index of a ``ProjectedSonarImage``'s or ``RawSonarImage``'s bytes.
+    data_order : slowest index of a ``ProjectedSonarImage``'s or ``RawSonarImage``'s bytes; "auto"
+        is found by the first images: neighbours look alike.
     water_density_kg_m3 : turns pressure into depth.
     image_aperture_rad, image_max_range_m : fan of a ``sensor_msgs/Image``, whose rows are ranges
         and whose columns are beams; 0: not known.
@@ -56,7 +57,7 @@ class ReadSettings:
 
     vehicle_id: str = ""
     role: str = ""
-    data_order: str = "range_major"
+    data_order: str = "auto"
     water_density_kg_m3: float = 1025.0
     image_aperture_rad: float = 0.0
     image_max_range_m: float = 0.0
