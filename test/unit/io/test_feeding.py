@@ -169,6 +169,19 @@ def test_points_of_space_need_no_level_sonar():
     np.testing.assert_allclose(submaps[0].points, submaps[1].points, atol=1e-9)
 
 
+def test_the_sea_bed_is_no_wall():
+    # A sonar whose z looks ahead (columns: where x, y, z of its frame point to).
+    mounted = np.eye(4)
+    mounted[:3, :3] = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]
+    wall, bed = [0.2, -3.0, 6.0], [-2.5, 1.0, 4.0]
+    mapper = VehicleMapper(CONFIG, "auv_1")
+    for event in weaving():
+        feed(mapper, event, np.eye(4))
+    cloud = PointsEvent("auv_1", 10 * S, "auv_1/sonar", np.array([wall, bed]), 1.0)
+    feed(mapper, cloud, mounted)
+    assert len(mapper.finish()[-1].points) == 1
+
+
 def test_frames_that_no_transform_mentions_are_told():
     mountings = Mountings("auv_1/base_link")
     dvl = VelocityEvent("auv_1", 0, "dvl_a50", np.array([1.0, 0.2, 0.0]), None, is_z_down=True)

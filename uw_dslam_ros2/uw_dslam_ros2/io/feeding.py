@@ -195,6 +195,7 @@ def _feed_points(
     if R_level_base is not None:
         T_level_sensor[:3] = R_level_base @ T_level_sensor[:3]
     points = event.points @ T_level_sensor[:3, :3].T
+    points = points[np.abs(points[:, 2]) <= event.max_height_m]
     T_base_points = SE2(float(T_level_sensor[0, 3]), float(T_level_sensor[1, 3]), 0.0)
     return mapper.add_points(event.stamp_ns, points[:, :2], T_base_points)
 

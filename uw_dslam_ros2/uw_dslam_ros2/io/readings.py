@@ -128,12 +128,17 @@ class ScanEvent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointsEvent:
-    """Echoes (N, 2) [m], x forward, y to port."""
+    """Echoes (N, 2) [m], x forward, y to port; or (N, 3) of space in the frame's axes.
+
+    Of the latter, those further than ``max_height_m`` above or below the sonar are no walls: the
+    sea bed, the surface.
+    """
 
     vehicle_id: str
     stamp_ns: int
     frame_id: str
     points: FloatArray
+    max_height_m: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -169,22 +169,24 @@ XYZ = [("x", "f4"), ("y", "f4"), ("z", "f4")]
 
 
 @pytest.mark.parametrize("is_bigendian", [False, True])
-def test_the_sea_bed_is_no_wall(is_bigendian):
+def test_points_of_space_come_with_a_gate(is_bigendian):
     rows = [(4, 3, 0.5), (5, 0, -3.0), (np.nan, 0, 0), (1, -2, 0)]
     (event,) = read(CLOUD, cloud(XYZ, rows, is_bigendian))
     assert isinstance(event, PointsEvent)
-    assert event.points.tolist() == [[4.0, 3.0], [1.0, -2.0]]
-    (event,) = read(CLOUD, cloud(XYZ, rows), replace(SETTINGS, point_max_height_m=5.0))
-    assert len(event.points) == 3
+    assert event.points.tolist() == [[4.0, 3.0, 0.5], [5.0, 0.0, -3.0], [1.0, -2.0, 0.0]]
+    assert event.max_height_m == 1.0
+    (event,) = read(CLOUD, cloud(XYZ, rows[2:]))
+    assert event.points.tolist() == [[1.0, -2.0]]
 
 
-def test_a_cloud_in_other_axes_is_told_once():
-    told = []
-    settings = replace(SETTINGS, tell=told.append, memory={})
-    for _ in range(2):
-        (event,) = read(CLOUD, cloud(XYZ, [(0, 1, 5), (1, 1, 6)]), settings)
-        assert event.points.shape == (0, 2)
-    assert [f.kind for f in told] == ["sonar_points_height"]
+def test_the_sea_bed_is_no_beam():
+    rows = [(4, 3, 0.5, 0.0), (5, 0, -3.0, 1.0), (0, 2, 0.0, 2.0)]
+    (event,) = read(CLOUD, cloud([*XYZ, ("t", "f4")], rows))
+    assert event.range_m.tolist() == [5.0, 2.0]
+    bed = [(4, 3, -3.0, 0.0), (5, 0, -3.0, 1.0)]
+    (event,) = read(CLOUD, cloud([*XYZ, ("t", "f4")], bed))
+    assert isinstance(event, PointsEvent)
+    assert len(event.points) == 0
 
 
 @pytest.mark.parametrize(
@@ -261,7 +263,7 @@ def test_a_beam_or_a_sector_of_a_micron(bearings):
 
 
 def test_an_old_cloud_of_echoes():
-    points = [Msg(x=4.0, y=3.0, z=0.0), Msg(x=1.0, y=0.0, z=-9.0), Msg(x=0.0, y=-2.0, z=0.0)]
+    points = [Msg(x=4.0, y=3.0, z=0.0), Msg(x=np.nan, y=0.0, z=0.0), Msg(x=0.0, y=-2.0, z=0.0)]
     (event,) = read(OLD, Msg(header=header(), points=points, channels=[]))
     assert event.points.tolist() == [[4.0, 3.0], [0.0, -2.0]]
     assert read(OLD, Msg(header=header(), points=[], channels=[])) == ()

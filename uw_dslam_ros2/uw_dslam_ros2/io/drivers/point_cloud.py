@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io.drivers.adapter import Adapter, as_bytes, key_of, stamp_of
 from uw_dslam_ros2.io.drivers.laser_scan import ONE_MOMENT_S
 from uw_dslam_ros2.io.drivers.settings import ReadSettings
@@ -27,37 +26,33 @@ _MIN_BINS = 8
 
 
 def read_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | BeamsEvent]:
-    """Echoes near the horizontal plane of their frame.
+    """Echoes of one moment, in the plane or in space.
 
     With a field of times (seconds as reals, nanoseconds as integers; from the stamp, or absolute)
-    that span more than a moment, they are beams of a sonar that turns.
+    that span more than a moment, those near the frame's plane are beams of a sonar that turns.
     """
     cells, fields, order = _cells(msg)
-    x, y = (_column(cells, fields, order, name) for name in ("x", "y"))
-    is_used = np.isfinite(x) & np.isfinite(y)
-    if "z" in fields:
-        z = _column(cells, fields, order, "z")
-        is_near = is_used & (np.abs(z) <= settings.point_max_height_m)
-        if is_used.any() and not is_near.any():
-            settings.tell_once(
-                Finding(
-                    "sonar_points_height",
-                    "sonar",
-                    f"all {int(is_used.sum())} points of a cloud are more than "
-                    f"{settings.point_max_height_m:g} m above or below its frame and are left "
-                    "out; check the frame's axes (z up), or set point_max_height_m",
-                )
-            )
-        is_used = is_near
-    points = np.column_stack([x, y])[is_used]
+    names = ("x", "y", "z") if "z" in fields else ("x", "y")
+    points = np.column_stack([_column(cells, fields, order, name) for name in names])
+    is_used = np.isfinite(points).all(axis=1)
     offset_s = _offsets(cells, fields, order, stamp_of(msg))
     if offset_s is not None and is_used.any():
-        offset_s = offset_s[is_used]
-        if not np.isfinite(offset_s).all():
+        if not np.isfinite(offset_s[is_used]).all():
             raise InvalidInputError("the field of times holds values that are not finite")
-        if float(np.ptp(offset_s)) >= ONE_MOMENT_S:
-            return (_beams(msg, settings, points, offset_s),)
-    return (PointsEvent(*key_of(msg, settings), points),)
+        if float(np.ptp(offset_s[is_used])) >= ONE_MOMENT_S:
+            if points.shape[1] == 3:
+                is_used &= np.abs(points[:, 2]) <= settings.point_max_height_m
+            return (_beams(msg, settings, points[is_used], offset_s[is_used]),)
+    return (_points(msg, settings, points[is_used]),)
+
+
+def _points(msg: Any, settings: ReadSettings, points: FloatArray) -> PointsEvent:
+    """Points (N, 2) or (N, 3); flat ones lie in a fan."""
+    is_flat = points.shape[1] == 2 or not points[:, 2].any()
+    key = key_of(msg, settings)
+    if is_flat:
+        return PointsEvent(*key, np.ascontiguousarray(points[:, :2]))
+    return PointsEvent(*key, points, settings.point_max_height_m)
 
 
 def _cells(msg: Any) -> tuple[NDArray[np.uint8], dict[str, Any], str]:
@@ -102,9 +97,13 @@ def _offsets(
     return values - stamp_ns * 1e-9 if float(np.nanmax(np.abs(values))) > 86400.0 else values
 
 
-def _beams(msg: Any, settings: ReadSettings, points: FloatArray, offset_s: FloatArray) -> Any:
+def _beams(
+    msg: Any, settings: ReadSettings, points: FloatArray, offset_s: FloatArray
+) -> BeamsEvent | PointsEvent:
     stamps = stamp_of(msg) + np.round(offset_s * 1e9).astype(np.int64)
     order = np.argsort(stamps, kind="stable")
+    if len(order) == 0:
+        return _points(msg, settings, points)
     ranges = np.hypot(points[order, 0], points[order, 1])
     vehicle_id, _, frame_id = key_of(msg, settings)
     return BeamsEvent(
@@ -149,8 +148,7 @@ def read_old_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | B
                     intensity,
                 ),
             )
-    is_used = np.isfinite(xyz).all(axis=1) & (np.abs(xyz[:, 2]) <= settings.point_max_height_m)
-    return (PointsEvent(*key_of(msg, settings), xyz[is_used, :2]),)
+    return (_points(msg, settings, xyz[np.isfinite(xyz).all(axis=1)]),)
 
 
 def _bins(

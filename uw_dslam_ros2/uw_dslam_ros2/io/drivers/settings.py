@@ -49,7 +49,7 @@ class ReadSettings:
     sonar_angle_unit : of ``SonarEcho.angle``.
     scan_period_s : time of a turn of a ``LaserScan``; 0: as the message says.
     scan_stamp : the ray that a ``LaserScan``'s stamp belongs to.
-    point_max_height_m : points further above or below their frame's plane are left out.
+    point_max_height_m : points further above or below the sonar are left out.
     pressure : "auto" takes for gauge what is too little to be absolute.
     tell : called with what is noticed about the messages.
     memory : what adapters remember of this topic from one message to the next.
