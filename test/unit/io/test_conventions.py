@@ -1,0 +1,91 @@
+"""Readings of other conventions, corrected, are those that were meant."""
+
+import math
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.sonar.types import SonarImage
+from uw_dslam_ros2.io.conventions import correct, correct_mounting
+from uw_dslam_ros2.io.readings import DepthEvent, ImageEvent, ImuEvent, PointsEvent, VelocityEvent
+
+SECOND = 1_000_000_000
+KEY = ("auv_1", 100 * SECOND, "frame")
+
+
+def imu(yaw, rates=(0.1, 0.2, 0.3)):
+    q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
+    return ImuEvent(*KEY, q, 0.01, np.array(rates))
+
+
+def velocity(x, y, z=0.0):
+    return VelocityEvent(*KEY, np.array([x, y, z]), np.diag([1.0, 2.0, 3.0]))
+
+
+def image():
+    intensity = np.arange(12, dtype=np.uint16).reshape(4, 3)
+    return ImageEvent(
+        *KEY, SonarImage(KEY[1], intensity, np.arange(1.0, 5.0), np.array([0.5, 0.0, -0.4]))
+    )
+
+
+@pytest.mark.parametrize("event", [imu(1.0), velocity(1.0, 2.0), image(), DepthEvent(*KEY, 3.0)])
+def test_the_defaults_change_nothing(event):
+    result = correct(event, Conventions())
+    for name in type(event).__slots__:
+        if name != "image":
+            np.testing.assert_array_equal(getattr(result, name), getattr(event, name))
+
+
+def test_a_heading_from_north_becomes_a_yaw_from_east():
+    # A heading of 30 degrees east of north, turning to starboard.
+    event = imu(math.radians(30.0), (0.1, 0.2, 0.3))
+    result = correct(event, Conventions(imu_orientation="ned", imu_rates="frd"))
+    assert result.yaw_rad == pytest.approx(math.radians(60.0))
+    np.testing.assert_allclose(result.angular_velocity_rad_s, [0.1, -0.2, -0.3])
+
+
+def test_a_bow_up_stays_up_from_ned():
+    # Nose up by 0.2 in forward-right-down axes is a positive pitch about y to starboard.
+    event = ImuEvent(*KEY, np.array([0.0, math.sin(0.1), 0.0, math.cos(0.1)]), None, None)
+    x, y, z, w = correct(event, Conventions(imu_orientation="ned")).orientation_xyzw
+    forward = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+    np.testing.assert_allclose(forward, [0.0, math.cos(0.2), math.sin(0.2)], atol=1e-12)
+
+
+def test_what_is_not_filled_is_not_used():
+    assert correct(imu(1.0), Conventions(imu_orientation="none")).orientation_xyzw is None
+    assert correct(imu(1.0), Conventions(imu_rates="none")).angular_velocity_rad_s is None
+    assert correct(imu(1.0), Conventions(imu_rates="none", imu_orientation="none")) is None
+    degrees = correct(imu(1.0), Conventions(imu_rates_in_degrees=True))
+    np.testing.assert_allclose(degrees.angular_velocity_rad_s, np.radians([0.1, 0.2, 0.3]))
+
+
+def test_velocities_are_scaled_mirrored_and_dropped():
+    conventions = Conventions(velocity_scale=0.01, velocity_is_mirrored=True)
+    result = correct(velocity(100.0, 50.0), conventions)
+    np.testing.assert_allclose(result.velocity_m_s, [1.0, -0.5, 0.0])
+    np.testing.assert_allclose(np.diag(result.covariance), [1e-4, 2e-4, 3e-4])
+    conventions = Conventions(velocity_zero_is_invalid=True)
+    assert correct(velocity(0.0, 0.0, 0.0), conventions) is None
+    assert correct(velocity(0.1, 0.0), conventions) is not None
+
+
+def test_pings_are_mirrored_scaled_and_put_in_time():
+    conventions = Conventions(sonar_is_mirrored=True, sonar_range_scale=1.1, sonar_delay_s=0.25)
+    result = correct(image(), conventions)
+    assert result.stamp_ns == result.image.stamp_ns == 100 * SECOND - SECOND // 4
+    np.testing.assert_allclose(result.image.bearing_rad, [-0.5, 0.0, 0.4])
+    np.testing.assert_allclose(result.image.range_m, 1.1 * np.arange(1.0, 5.0))
+    points = correct(PointsEvent(*KEY, np.array([[1.0, 2.0]])), conventions)
+    np.testing.assert_allclose(points.points, [[1.1, -2.2]])
+
+
+def test_mountings_turn_as_seen_from_above_whatever_the_instruments_axes():
+    conventions = Conventions(velocity_yaw_offset_rad=0.5 * math.pi)
+    downward = np.diag([1.0, -1.0, -1.0, 1.0])
+    for mounting in (np.eye(4), downward):
+        turned = correct_mounting(velocity(1.0, 0.0), mounting, conventions)
+        np.testing.assert_allclose(turned[:3, :3] @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
+    assert correct_mounting(image(), downward, conventions) is downward

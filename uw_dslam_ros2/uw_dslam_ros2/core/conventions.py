@@ -1,0 +1,63 @@
+"""What a recording means by its numbers, where that is not what its messages' types say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from uw_dslam_ros2.core.config import Config, setting
+
+__all__ = ["Conventions"]
+
+
+@dataclass(frozen=True, slots=True)
+class Conventions(Config):
+    """Corrections between what the instruments' drivers wrote and what their messages mean.
+
+    With the defaults nothing is changed. ``doctor`` finds these and writes them down.
+    """
+
+    imu_orientation: str = setting(
+        "enu",
+        choices=("enu", "ned", "none"),
+        doc="orientation of the IMU: enu (of a forward-left-up body in east-north-up, as ROS has "
+        "it), ned (of a forward-right-down body in north-east-down) or none (it says nothing)",
+    )
+    imu_rates: str = setting(
+        "flu",
+        choices=("flu", "frd", "none"),
+        doc="axes of its rates: flu (forward, left, up), frd (forward, right, down) or none "
+        "(never filled)",
+    )
+    imu_rates_in_degrees: bool = setting(False, doc="its rates are in degrees per second")
+    imu_delay_s: float = setting(
+        0.0, -1e6, 1e6, "how much later than true the IMU's stamps are [s]"
+    )
+    velocity_yaw_offset_rad: float = setting(
+        0.0, -3.2, 3.2, "turns the measured velocity, counter-clockwise seen from above [rad]"
+    )
+    velocity_is_mirrored: bool = setting(
+        False, doc="the velocity's sideways axis has the wrong sign; set right before it is turned"
+    )
+    velocity_scale: float = setting(1.0, 1e-4, 1e4, "factor on the measured velocity")
+    velocity_zero_is_invalid: bool = setting(
+        False, doc="a velocity of exactly zero means that there was none (no bottom lock)"
+    )
+    velocity_delay_s: float = setting(
+        0.0, -1e6, 1e6, "how much later than true the velocity's stamps are [s]"
+    )
+    sonar_is_mirrored: bool = setting(False, doc="port and starboard of the sonar are exchanged")
+    sonar_yaw_offset_rad: float = setting(
+        0.0, -3.2, 3.2, "turns the echoes about the sonar, counter-clockwise seen from above [rad]"
+    )
+    sonar_range_scale: float = setting(1.0, 0.1, 10.0, "factor on the ranges (sound speed)")
+    sonar_delay_s: float = setting(
+        0.0, -1e6, 1e6, "how much later than true the sonar's stamps are [s]"
+    )
+
+    def changes(self) -> dict[str, str | float | bool]:
+        """Those that differ from the defaults."""
+        return {
+            f.name: getattr(self, f.name)
+            for f in fields(self)
+            if getattr(self, f.name) != f.default
+        }

@@ -1,0 +1,155 @@
+"""Readings as they are meant: corrected where a driver follows another convention."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.io.readings import (
+    BeamsEvent,
+    Event,
+    ImageEvent,
+    ImuEvent,
+    PointsEvent,
+    ScanEvent,
+    VelocityEvent,
+)
+
+__all__ = ["correct", "correct_mounting"]
+
+FloatArray = NDArray[np.float64]
+
+_HALF = math.sqrt(0.5)
+# Quaternions [x, y, z, w]: of north-east-down in east-north-up, of forward-right-down in
+# forward-left-up.
+_Q_ENU_NED = (_HALF, _HALF, 0.0, 0.0)
+_Q_FRD_FLU = (1.0, 0.0, 0.0, 0.0)
+
+_Ping = ImageEvent | ScanEvent | PointsEvent | BeamsEvent
+
+
+def correct(event: Event, conventions: Conventions) -> Event | None:
+    """What a reading says in the usual conventions; None where it says nothing then.
+
+    All but the angles of mounting, which `correct_mounting` takes.
+    """
+    if isinstance(event, ImuEvent):
+        return _imu(event, conventions)
+    if isinstance(event, VelocityEvent):
+        return _velocity(event, conventions)
+    if isinstance(event, _Ping):
+        return _ping(event, conventions)
+    return event
+
+
+def correct_mounting(
+    event: Event, T_base_sensor: FloatArray, conventions: Conventions
+) -> FloatArray:
+    """``T_base_sensor`` (4, 4) with the instrument turned as the conventions say."""
+    yaw_rad = 0.0
+    if isinstance(event, VelocityEvent):
+        yaw_rad = conventions.velocity_yaw_offset_rad
+    elif isinstance(event, _Ping):
+        yaw_rad = conventions.sonar_yaw_offset_rad
+    if yaw_rad == 0.0:
+        return T_base_sensor
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    turned = T_base_sensor.copy()
+    turned[:3, :3] = (
+        np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ (T_base_sensor[:3, :3])
+    )
+    return turned
+
+
+def _earlier(stamp_ns: int, delay_s: float) -> int:
+    return stamp_ns - round(delay_s * 1e9)
+
+
+def _imu(event: ImuEvent, conventions: Conventions) -> ImuEvent | None:
+    orientation, rates = event.orientation_xyzw, event.angular_velocity_rad_s
+    if conventions.imu_orientation == "none":
+        orientation = None
+    elif conventions.imu_orientation == "ned" and orientation is not None:
+        orientation = _product(_product(_Q_ENU_NED, tuple(orientation)), _Q_FRD_FLU)
+    if conventions.imu_rates == "none":
+        rates = None
+    elif rates is not None:
+        axes = (1.0, -1.0, -1.0) if conventions.imu_rates == "frd" else (1.0, 1.0, 1.0)
+        unit = math.pi / 180.0 if conventions.imu_rates_in_degrees else 1.0
+        rates = rates * np.array(axes) * unit
+    if orientation is None and rates is None:
+        return None
+    return replace(
+        event,
+        stamp_ns=_earlier(event.stamp_ns, conventions.imu_delay_s),
+        orientation_xyzw=orientation,
+        angular_velocity_rad_s=rates,
+    )
+
+
+def _product(a: tuple[float, ...] | FloatArray, b: tuple[float, ...]) -> FloatArray:
+    """Product of two quaternions [x, y, z, w]."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return np.array(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ]
+    )
+
+
+def _velocity(event: VelocityEvent, conventions: Conventions) -> VelocityEvent | None:
+    if conventions.velocity_zero_is_invalid and not event.velocity_m_s[:2].any():
+        return None
+    axes = np.array([1.0, -1.0 if conventions.velocity_is_mirrored else 1.0, 1.0])
+    factors = axes * conventions.velocity_scale
+    covariance = event.covariance
+    return replace(
+        event,
+        stamp_ns=_earlier(event.stamp_ns, conventions.velocity_delay_s),
+        velocity_m_s=event.velocity_m_s * factors,
+        covariance=None if covariance is None else covariance * np.outer(factors, factors),
+    )
+
+
+def _ping(event: _Ping, conventions: Conventions) -> _Ping:
+    stamp_ns = _earlier(event.stamp_ns, conventions.sonar_delay_s)
+    side = -1.0 if conventions.sonar_is_mirrored else 1.0
+    scale = conventions.sonar_range_scale
+    match event:
+        case ImageEvent(image=image):
+            image = replace(
+                image,
+                stamp_ns=stamp_ns,
+                range_m=image.range_m * scale,
+                bearing_rad=image.bearing_rad * side,
+            )
+            return replace(event, stamp_ns=stamp_ns, image=image)
+        case ScanEvent():
+            return replace(
+                event,
+                stamp_ns=stamp_ns,
+                angles_rad=event.angles_rad * side,
+                ranges_m=event.ranges_m * scale,
+                range_max_m=event.range_max_m * scale,
+            )
+        case PointsEvent(points=points):
+            factors = np.ones(points.shape[1])
+            factors[1] = side
+            return replace(event, stamp_ns=stamp_ns, points=points * factors * scale)
+        case BeamsEvent():
+            return replace(
+                event,
+                stamp_ns=stamp_ns,
+                beam_stamp_ns=event.beam_stamp_ns - round(conventions.sonar_delay_s * 1e9),
+                bearing_rad=event.bearing_rad * side,
+                range_m=event.range_m * scale,
+                range_max_m=event.range_max_m * scale,
+            )
