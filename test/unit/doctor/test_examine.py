@@ -1,0 +1,120 @@
+"""Each wrong convention is named, with what mends it; nothing is said where nothing is wrong."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from unit.doctor.made_up_vehicle import vehicle
+
+from uw_dslam_ros2.core.doctor import PingSample, examine
+
+SEEDS = (1, 2)
+
+
+@pytest.fixture(scope="module", params=SEEDS)
+def recording(request):
+    return vehicle(request.param)
+
+
+def turned(points, angle_rad):
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return points @ np.array([[cos, sin], [-sin, cos]])
+
+
+def imu(change):
+    def corrupt(navigation, pings):
+        yaw, rate = change(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
+        return replace(navigation, yaw_rad=yaw, yaw_rate_rad_s=rate), pings
+
+    return corrupt
+
+
+def dvl(change):
+    def corrupt(navigation, pings):
+        velocity = change(navigation.velocity_s, navigation.velocity_m_s)
+        return replace(navigation, velocity_m_s=velocity), pings
+
+    return corrupt
+
+
+def sonar(change, delay_s=0.0):
+    def corrupt(navigation, pings):
+        points = tuple(change(p) for p in pings.points)
+        return navigation, PingSample(pings.stamp_s + delay_s, points, pings.T_base_sonar)
+
+    return corrupt
+
+
+def without_lock(t, v):
+    return np.where(((t > 30.0) & (t < 50.0))[:, None], 0.0, v)
+
+
+def near_steel(t, yaw, rate):
+    bump = np.sin(math.pi * (np.clip(t, 30.0, 50.0) - 30.0) / 20.0)
+    return yaw + math.radians(20.0) * bump, rate
+
+
+# Cause, how a recording gets it, and what mends it.
+CASES = {
+    "imu_ned": (
+        imu(lambda _, yaw, rate: (0.5 * math.pi - yaw, -rate)),
+        {"imu_orientation": "ned", "imu_rates": "frd"},
+    ),
+    "imu_no_orientation": (
+        imu(lambda _, yaw, rate: (0.0 * yaw, rate)), {"imu_orientation": "none"},
+    ),
+    "imu_no_rates": (imu(lambda _, yaw, rate: (yaw, 0.0 * rate)), {"imu_rates": "none"}),
+    "imu_rates_frd": (imu(lambda _, yaw, rate: (yaw, -rate)), {"imu_rates": "frd"}),
+    "imu_rates_in_degrees": (
+        imu(lambda _, yaw, rate: (yaw, np.degrees(rate))), {"imu_rates_in_degrees": True},
+    ),
+    "heading_disturbed": (imu(near_steel), {"imu_orientation": "none"}),
+    "dvl_sign": (dvl(lambda _, v: -v), {"velocity_yaw_offset_rad": math.pi}),
+    "dvl_turned": (dvl(lambda _, v: turned(v, -0.8)), {"velocity_yaw_offset_rad": 0.8}),
+    "dvl_mirrored": (dvl(lambda _, v: v * [1.0, -1.0]), {"velocity_is_mirrored": True}),
+    "dvl_unit": (dvl(lambda _, v: 1000.0 * v), {"velocity_scale": 0.001}),
+    "scale": (dvl(lambda _, v: 1.05 * v), {}),
+    "dvl_zero_without_lock": (dvl(without_lock), {"velocity_zero_is_invalid": True}),
+    "sonar_mirrored": (sonar(lambda p: p * [1.0, -1.0]), {"sonar_is_mirrored": True}),
+    "sonar_turned": (sonar(lambda p: turned(p, 1.6)), {"sonar_yaw_offset_rad": -1.6}),
+    "sonar_delay": (sonar(lambda p: p, 0.3), {"sonar_delay_s": 0.3}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_the_cause_is_named_and_mended(recording, kind):
+    corrupt, mends = CASES[kind]
+    found = examine(*corrupt(*recording), "auv_1")
+    assert [finding.kind for finding in found.findings] == [kind]
+    assert found.findings[0].vehicle_id == "auv_1"
+    changes = found.conventions.changes()
+    assert set(changes) == set(mends)
+    for name, value in mends.items():
+        assert changes[name] == pytest.approx(value, abs=0.03)
+
+
+def test_nothing_is_said_where_nothing_is_wrong(recording):
+    found = examine(*recording)
+    assert found.findings == []
+    assert found.conventions.changes() == {}
+    assert found.num_ping_motions > 40
+
+
+def test_without_echoes_only_what_needs_none_is_said(recording):
+    navigation, pings = recording
+    nothing = PingSample(pings.stamp_s, (np.empty((0, 2)),) * len(pings.stamp_s))
+    reversed_sign = replace(navigation, velocity_m_s=-navigation.velocity_m_s)
+    assert examine(reversed_sign, nothing).findings == []
+    zeros = dvl(without_lock)(navigation, nothing)
+    assert [f.kind for f in examine(*zeros).findings] == ["dvl_zero_without_lock"]
+
+
+def test_it_cannot_tell_who_is_mirrored_without_a_dvl(recording):
+    navigation, pings = sonar(lambda p: p * [1.0, -1.0])(*recording)
+    alone = replace(
+        navigation, velocity_s=navigation.velocity_s[:0], velocity_m_s=navigation.velocity_m_s[:0]
+    )
+    found = examine(alone, pings)
+    assert [finding.kind for finding in found.findings] == ["handedness"]
+    assert found.conventions.changes() == {}

@@ -1,0 +1,150 @@
+"""Takes readings as a vehicle mapper does, and keeps them as arrays."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar import (
+    Detections,
+    SonarConfig,
+    SonarImage,
+    detect,
+    detections_from_points,
+    detections_from_scan,
+)
+from uw_dslam_ros2.core.submap import Submap
+
+__all__ = ["SampleCollector"]
+
+FloatArray = NDArray[np.float64]
+
+
+class SampleCollector:
+    """Has the inputs of a `VehicleMapper`, so that `io.feeding.feed` serves both alike.
+
+    What arrives is in base_link's axes, whatever the instruments' mountings and messages.
+    """
+
+    def __init__(self, sonar: SonarConfig = SonarConfig()) -> None:  # noqa: B008 (frozen)
+        self._sonar = sonar
+        self._imu: list[tuple[int, float, float]] = []
+        self._velocity: list[tuple[int, float, float]] = []
+        self._T_base_dvl = SE2()
+        self._pings: list[tuple[int, FloatArray]] = []
+        self._T_base_sonar = SE2()
+
+    @property
+    def start_ns(self) -> int:
+        """What seconds are counted from: the first reading."""
+        stamps = [rows[0][0] for rows in (self._imu, self._velocity, self._pings) if rows]
+        return min(stamps, default=0)
+
+    def attitude_at(self, stamp_ns: int) -> None:  # noqa: ARG002 (as a mapper has it)
+        """Nothing is known of roll and pitch here: the vehicle counts as level."""
+        return
+
+    def add_imu(
+        self,
+        stamp_ns: int,
+        yaw_rad: float | None,
+        yaw_rate_rad_s: float | None,
+        *_: Any,
+        **__: Any,
+    ) -> None:
+        """As a mapper's; only yaw and yaw rate are kept."""
+        nan = math.nan
+        self._imu.append(
+            (
+                stamp_ns,
+                nan if yaw_rad is None else yaw_rad,
+                nan if yaw_rate_rad_s is None else yaw_rate_rad_s,
+            )
+        )
+
+    def add_velocity(
+        self,
+        stamp_ns: int,
+        v_body_m_s: ArrayLike,
+        covariance: ArrayLike | None = None,  # noqa: ARG002 (as a mapper has it)
+        T_base_sensor: SE2 = SE2(),
+    ) -> None:
+        """As a mapper's."""
+        velocity = T_base_sensor.rotation() @ np.asarray(v_body_m_s, dtype=np.float64)
+        if np.isfinite(velocity).all():
+            self._velocity.append((stamp_ns, float(velocity[0]), float(velocity[1])))
+            self._T_base_dvl = T_base_sensor
+
+    def add_depth(self, stamp_ns: int, depth_m: float) -> None:
+        """Depth says nothing of conventions in the plane."""
+
+    def add_pose(self, *_: Any, **__: Any) -> None:
+        """The vehicle's own odometry is not examined."""
+
+    def add_beams(self, *_: Any, **__: Any) -> list[Submap]:
+        """Single beams do not show from ping to ping how the sonar moved."""
+        return []
+
+    def add_image(self, image: SonarImage, T_base_sonar: SE2, *_: Any) -> list[Submap]:
+        """As a mapper's."""
+        return self._add(detect(image, self._sonar), T_base_sonar)
+
+    def add_scan(
+        self,
+        stamp_ns: int,
+        angles_rad: ArrayLike,
+        ranges_m: ArrayLike,
+        range_max_m: float,
+        T_base_sonar: SE2,
+        *_: Any,
+    ) -> list[Submap]:
+        """As a mapper's."""
+        found = detections_from_scan(stamp_ns, angles_rad, ranges_m, range_max_m, self._sonar)
+        return self._add(found, T_base_sonar)
+
+    def add_points(
+        self, stamp_ns: int, points: ArrayLike, T_base_sonar: SE2, *_: Any
+    ) -> list[Submap]:
+        """As a mapper's."""
+        return self._add(detections_from_points(stamp_ns, points, self._sonar), T_base_sonar)
+
+    def _add(self, detections: Detections, T_base_sonar: SE2) -> list[Submap]:
+        self._pings.append((detections.stamp_ns, detections.points))
+        self._T_base_sonar = T_base_sonar
+        return []
+
+    def navigation(self) -> NavigationSample:
+        """What the IMU and the DVL said, in order of stamps."""
+        imu, velocity = _sorted(self._imu), _sorted(self._velocity)
+        mount = self._T_base_dvl
+        return NavigationSample(
+            self._seconds([row[0] for row in imu]),
+            np.array([row[1] for row in imu]),
+            np.array([row[2] for row in imu]),
+            self._seconds([row[0] for row in velocity]),
+            np.array([row[1:] for row in velocity]).reshape(-1, 2),
+            (mount.x, mount.y),
+            mount.yaw,
+        )
+
+    def pings(self) -> PingSample:
+        """What the sonar said, in order of stamps."""
+        pings = sorted(self._pings, key=lambda ping: ping[0])
+        return PingSample(
+            self._seconds([stamp_ns for stamp_ns, _ in pings]),
+            tuple(points for _, points in pings),
+            self._T_base_sonar,
+        )
+
+    def _seconds(self, stamps_ns: list[int]) -> FloatArray:
+        seconds = (np.array(stamps_ns, dtype=np.int64) - self.start_ns) * 1e-9
+        return np.asarray(seconds, dtype=np.float64)
+
+
+def _sorted(rows: list[tuple[int, float, float]]) -> list[tuple[int, float, float]]:
+    return sorted(rows, key=lambda row: row[0])

@@ -1,0 +1,415 @@
+"""Which conventions a recording follows: each is tried, and the one that fits best is named.
+
+The sonar's own motion from ping to ping is the judge: it turns as the IMU says, and moves as the
+DVL says, if all are read rightly. Of two readings that fit equally well neither is named.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.doctor.fits import (
+    TurnFit,
+    VelocityFit,
+    confidence_of,
+    fit_turns,
+    fit_velocity,
+)
+from uw_dslam_ros2.core.doctor.imu import ImuState, compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
+from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
+from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.core.se2 import wrap_angle
+
+__all__ = ["Examination", "examine"]
+
+FloatArray = NDArray[np.float64]
+
+_SURE = 0.99
+_MIN_MOTIONS = 15
+_MAX_TURN_COST = 1.5
+_MIN_DELAY_S = 0.08
+_MIN_OFFSET_RAD = math.radians(4.0)
+_MIN_SCALE_ERROR = 0.019
+_UNIT_SCALE = 1.3
+_UNITS = {
+    "millimetres per second": 1e-3, "centimetres per second": 1e-2, "knots": 0.5144,
+    "kilometres per hour": 1.0 / 3.6,
+}  # fmt: skip
+_SWING_RAD = math.radians(8.6)
+_ZEROS_IN_A_ROW = 3
+_MOVES_M_S = 0.15
+
+
+@dataclass(slots=True)
+class Examination:
+    """What was found, surest cause first, and the conventions that mend it."""
+
+    findings: list[Finding] = field(default_factory=list)
+    conventions: Conventions = field(default_factory=Conventions)
+    num_ping_motions: int = 0
+
+    def add(self, finding: Finding, **changes: str | float | bool) -> None:
+        """Name a cause, and what to change."""
+        self.findings.append(finding)
+        self.conventions = Conventions(**(self.conventions.to_dict() | changes))
+
+
+def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "") -> Examination:
+    """Try the conventions of one vehicle's sensors.
+
+    `pings` are bursts: each but the last of a burst has another about a second later.
+    """
+    result = Examination()
+    imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
+    _judge_imu(result, imu, vehicle_id)
+    navigation = _without_zeros(result, navigation, vehicle_id)
+    motions = ping_motions(pings, 0.7, 2.1)
+    result.num_ping_motions = len(motions)
+    if len(motions) >= _MIN_MOTIONS:
+        _Trial(result, navigation, imu, motions, pings, vehicle_id).run()
+    return result
+
+
+def _judge_imu(result: Examination, imu: ImuState, vehicle_id: str) -> None:
+    if imu.is_orientation_constant:
+        assert imu.by_rates is not None
+        turned = math.degrees(float(np.ptp(imu.by_rates)))
+        result.add(
+            Finding(
+                "imu_no_orientation",
+                "imu",
+                f"its orientation never changes while its rates turn by {turned:.0f} degrees: the "
+                "driver does not fill it; use only the rates (conventions.imu_orientation: none)",
+                vehicle_id=vehicle_id,
+            ),
+            imu_orientation="none",
+        )
+    if imu.are_rates_zero:
+        result.add(
+            Finding(
+                "imu_no_rates",
+                "imu",
+                "its rates are all zero while its orientation turns: the driver does not fill "
+                "them; use only the orientation (conventions.imu_rates: none)",
+                vehicle_id=vehicle_id,
+            ),
+            imu_rates="none",
+        )
+    if 40.0 < abs(imu.ratio) < 80.0:
+        result.add(
+            Finding(
+                "imu_rates_in_degrees",
+                "imu",
+                f"its rates are {abs(imu.ratio):.1f} times too fast for its orientation: they are "
+                "in degrees per second (conventions.imu_rates_in_degrees: true)",
+                vehicle_id=vehicle_id,
+            ),
+            imu_rates_in_degrees=True,
+        )
+    if imu.swing_rad > _SWING_RAD:
+        result.add(
+            Finding(
+                "heading_disturbed",
+                "imu",
+                f"its heading swings by {math.degrees(imu.swing_rad):.0f} degrees against its "
+                "rates, as near steel; calibrate the compass, or use only the rates "
+                "(conventions.imu_orientation: none)",
+                vehicle_id=vehicle_id,
+            ),
+            imu_orientation="none",
+        )
+
+
+def _without_zeros(
+    result: Examination, navigation: NavigationSample, vehicle_id: str
+) -> NavigationSample:
+    """Tell of runs of exact zeros between velocities that are far from zero, and drop them."""
+    velocity = navigation.velocity_m_s
+    is_zero = ~velocity.any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_zero, [False]]).astype(int)))
+    num_false, longest_s = 0, 0.0
+    for begin, end in edges.reshape(-1, 2):
+        around = [velocity[i] for i in (begin - 1, end) if 0 <= i < len(velocity)]
+        speeds = [float(np.hypot(*v)) for v in around]
+        if end - begin >= _ZEROS_IN_A_ROW and speeds and max(speeds) > _MOVES_M_S:
+            num_false += int(end - begin)
+            last = min(end, len(velocity) - 1)
+            seconds = float(navigation.velocity_s[last] - navigation.velocity_s[begin])
+            longest_s = max(longest_s, seconds)
+    if num_false == 0:
+        return navigation
+    result.add(
+        Finding(
+            "dvl_zero_without_lock",
+            "velocity",
+            f"{num_false} velocities are exactly zero, up to {longest_s:.0f} s on end, while the "
+            "vehicle moves before and after: the dvl had no bottom lock "
+            "(conventions.velocity_zero_is_invalid: true)",
+            vehicle_id=vehicle_id,
+        ),
+        velocity_zero_is_invalid=True,
+    )
+    return replace(
+        navigation, velocity_s=navigation.velocity_s[~is_zero], velocity_m_s=velocity[~is_zero]
+    )
+
+
+class _Trial:
+    """The readings of one vehicle's sensors against the echoes' motion."""
+
+    def __init__(
+        self,
+        result: Examination,
+        navigation: NavigationSample,
+        imu: ImuState,
+        motions: PingMotions,
+        pings: PingSample,
+        vehicle_id: str,
+    ) -> None:
+        self._result = result
+        self._navigation = navigation
+        self._imu = imu
+        self._motions = motions
+        self._mount = pings.T_base_sonar
+        self._vehicle_id = vehicle_id
+
+    def run(self) -> None:
+        imu, imu_s = self._imu, self._navigation.imu_s
+        rates, orientation = None, None
+        if imu.by_rates is not None:
+            in_degrees = self._result.conventions.imu_rates_in_degrees
+            by_rates = imu.by_rates * (math.pi / 180.0 if in_degrees else 1.0)
+            rates = self._believed(fit_turns(self._motions, imu_s, by_rates))
+        if imu.by_orientation is not None:
+            orientation = self._believed(fit_turns(self._motions, imu_s, imu.by_orientation))
+        fits = rates or orientation
+        if fits is None:
+            return
+        yaw = by_rates if rates else imu.by_orientation
+        assert yaw is not None
+        if rates and orientation and rates[0].sign != orientation[0].sign:
+            self._say_one_flipped(rates[0].sign, orientation[0].sign, orientation)
+        elif fits[0].sign < 0:
+            self._judge_handedness(yaw, fits)
+        else:
+            self._judge_velocity(self._fit(yaw, fits), self._fit(yaw, fits, velocity=True))
+        self._judge_delay(fits)
+
+    def _believed(self, fits: list[TurnFit]) -> list[TurnFit] | None:
+        best, other = fits[0], fits[1]
+        is_close = float(np.mean(best.cost)) < _MAX_TURN_COST
+        return fits if is_close and confidence_of(best.cost, other.cost) > _SURE else None
+
+    def _fit(
+        self, yaw: FloatArray, fits: list[TurnFit], *, sonar: bool = False, velocity: bool = False
+    ) -> VelocityFit | None:
+        sign = 1 if sonar else fits[0].sign
+        return fit_velocity(
+            self._motions,
+            self._navigation,
+            sign * yaw,
+            fits[0].delay_s,
+            sonar=complex(self._mount.x, self._mount.y),
+            sonar_yaw_rad=self._mount.yaw,
+            is_sonar_mirrored=sonar,
+            is_velocity_mirrored=velocity,
+        )
+
+    def _add(
+        self,
+        kind: str,
+        role: str,
+        detail: str,
+        confidence: float = 1.0,
+        **changes: str | float | bool,
+    ) -> None:
+        finding = Finding(kind, role, detail, confidence, vehicle_id=self._vehicle_id)
+        self._result.add(finding, **changes)
+
+    # --- who turns the other way
+    # -------------------------------------------------------------------------------------------
+
+    def _say_one_flipped(self, rates: int, orientation: int, fits: list[TurnFit]) -> None:
+        sure = confidence_of(fits[0].cost, fits[1].cost)
+        if orientation < 0:
+            self._add(
+                "imu_ned",
+                "imu",
+                "its yaw turns against its own rates and against the sonar's echoes: it is a "
+                "heading that grows clockwise, as in NED (conventions.imu_orientation: ned)",
+                sure,
+                imu_orientation="ned",
+            )
+        if rates < 0:
+            self._add(
+                "imu_rates_frd",
+                "imu",
+                "its rates turn against its own yaw and against the sonar's echoes: their z axis "
+                "points down (conventions.imu_rates: frd)",
+                sure,
+                imu_rates="frd",
+            )
+
+    def _judge_handedness(self, yaw: FloatArray, fits: list[TurnFit]) -> None:
+        """Say who is the wrong way round where the echoes turn against the IMU."""
+        sonar, imu = self._fit(yaw, fits, sonar=True), self._fit(yaw, fits)
+        sure = 0.5
+        if sonar is not None and imu is not None:
+            sure = confidence_of(sonar.cost, imu.cost)
+        if sonar is not None and sure > _SURE:
+            self._add(
+                "sonar_mirrored",
+                "sonar",
+                "its echoes turn against the imu and move sideways against the dvl: port and "
+                "starboard are exchanged, or it hangs upside down "
+                "(conventions.sonar_is_mirrored: true)",
+                sure,
+                sonar_is_mirrored=True,
+            )
+            self._judge_velocity(sonar, None)
+        elif imu is not None and sure < 1.0 - _SURE:
+            changes = {"imu_orientation": "ned", "imu_rates": "frd"}
+            if self._imu.by_orientation is None:
+                del changes["imu_orientation"]
+            if self._imu.by_rates is None:
+                del changes["imu_rates"]
+            self._add(
+                "imu_ned",
+                "imu",
+                "it turns against the sonar's echoes, which move as the dvl says: its axes are "
+                "forward, right, down in north, east, down (conventions.imu_orientation: ned, "
+                "conventions.imu_rates: frd)",
+                1.0 - sure,
+                **changes,
+            )
+            self._judge_velocity(imu, None)
+        else:
+            self._add(
+                "handedness",
+                "",
+                "the sonar's echoes turn against the imu, and the dvl cannot tell which of them "
+                "is the wrong way round: try conventions.sonar_is_mirrored: true, or "
+                "conventions.imu_orientation: ned with conventions.imu_rates: frd",
+                0.5,
+            )
+
+    # --- the velocity
+    # -------------------------------------------------------------------------------------------
+
+    def _judge_velocity(self, fit: VelocityFit | None, mirrored: VelocityFit | None) -> None:
+        if fit is None:
+            return
+        if mirrored is not None and confidence_of(mirrored.cost, fit.cost) > _SURE:
+            # The instrument's own sideways axis is set right, before its mounting turns it.
+            offset = wrap_angle(mirrored.yaw_rad - 2.0 * self._navigation.velocity_mount_yaw_rad)
+            axes = "exchanged" if abs(abs(mirrored.yaw_rad) - 0.5 * math.pi) < 0.3 else "mirrored"
+            self._add(
+                "dvl_mirrored",
+                "velocity",
+                f"its sideways velocity is against the sonar's echoes: its axes are {axes} "
+                f"(conventions.velocity_is_mirrored: true, conventions.velocity_yaw_offset_rad: "
+                f"{offset:.2f})",
+                confidence_of(mirrored.cost, fit.cost),
+                velocity_is_mirrored=True,
+                velocity_yaw_offset_rad=round(offset, 4) if abs(offset) > _MIN_OFFSET_RAD else 0.0,
+            )
+            fit = mirrored
+        else:
+            self._judge_offset(fit)
+        self._judge_scale(fit)
+
+    def _judge_offset(self, fit: VelocityFit) -> None:
+        sigma = fit.factor_sigma / max(fit.scale, 1e-9)
+        offset = fit.yaw_rad
+        if abs(offset) < max(_MIN_OFFSET_RAD, 4.0 * sigma) or sigma > 0.2:
+            return
+        degrees = math.degrees(offset)
+        mean = complex(*np.median(self._navigation.velocity_m_s, axis=0))
+        # A vehicle goes ahead more often than not: who says so is right.
+        by_velocity = abs(np.angle(mean)) + 0.05
+        by_echoes = abs(np.angle(mean * np.exp(1j * offset)))
+        if by_echoes > by_velocity:
+            self._add(
+                "sonar_turned",
+                "sonar",
+                f"its echoes move as if it were mounted {-degrees:.0f} degrees from where tf says "
+                f"(conventions.sonar_yaw_offset_rad: {-offset:.3f}), counter-clockwise",
+                _confidence_in(offset, sigma),
+                sonar_yaw_offset_rad=round(-offset, 4),
+            )
+        elif abs(abs(degrees) - 180.0) < 15.0:
+            self._add(
+                "dvl_sign",
+                "velocity",
+                "its velocity has the wrong sign: it is the bottom's against the vehicle "
+                "(conventions.velocity_yaw_offset_rad: 3.1416)",
+                _confidence_in(offset, sigma),
+                velocity_yaw_offset_rad=round(math.pi, 4),
+            )
+        else:
+            self._add(
+                "dvl_turned",
+                "velocity",
+                f"its velocity is {-degrees:.0f} degrees off the sonar's motion: it is mounted "
+                f"turned (conventions.velocity_yaw_offset_rad: {offset:.3f})",
+                _confidence_in(offset, sigma),
+                velocity_yaw_offset_rad=round(offset, 4),
+            )
+
+    def _judge_scale(self, fit: VelocityFit) -> None:
+        sigma = fit.factor_sigma
+        error = abs(fit.scale - 1.0)
+        if error < max(_MIN_SCALE_ERROR, 3.0 * sigma):
+            return
+        if not 1.0 / _UNIT_SCALE < fit.scale < _UNIT_SCALE:
+            name, unit = min(_UNITS.items(), key=lambda item: abs(math.log(fit.scale / item[1])))
+            is_unit = abs(math.log(fit.scale / unit)) < 0.1
+            factor = unit if is_unit else fit.scale
+            self._add(
+                "dvl_unit",
+                "velocity",
+                f"its velocity is {1.0 / fit.scale:.3g} times that of the sonar's echoes"
+                + (f": it is in {name}" if is_unit else "")
+                + f" (conventions.velocity_scale: {factor:.4g})",
+                velocity_scale=float(f"{factor:.4g}"),
+            )
+            return
+        percent = 100.0 * (1.0 / fit.scale - 1.0)
+        self._add(
+            "scale",
+            "velocity",
+            f"its way is {abs(percent):.1f} % {'longer' if percent > 0.0 else 'shorter'} than the "
+            "sonar's echoes move: either the dvl's scale is wrong "
+            f"(conventions.velocity_scale: {fit.scale:.3f}), or the sonar's speed of sound "
+            f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f})",
+            _confidence_in(error - 0.5 * _MIN_SCALE_ERROR, sigma),
+        )
+
+    # --- time
+    # -------------------------------------------------------------------------------------------
+
+    def _judge_delay(self, fits: list[TurnFit]) -> None:
+        best, still = fits[0], fits[2]
+        sure = confidence_of(best.cost, still.cost)
+        if abs(best.delay_s) < _MIN_DELAY_S or sure < _SURE:
+            return
+        way = "later" if best.delay_s > 0.0 else "earlier"
+        self._add(
+            "sonar_delay",
+            "sonar",
+            f"its stamps are {abs(best.delay_s):.2f} s {way} than the imu's, by how both turn "
+            f"(conventions.sonar_delay_s: {best.delay_s:.2f})",
+            sure,
+            sonar_delay_s=round(best.delay_s, 3),
+        )
+
+
+def _confidence_in(value: float, sigma: float) -> float:
+    """How sure a value is not zero, 0.5 to 1."""
+    return 0.5 + 0.5 * math.erf(abs(value) / max(sigma, 1e-9) / math.sqrt(2.0))

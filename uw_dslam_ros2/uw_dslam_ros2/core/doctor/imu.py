@@ -1,0 +1,102 @@
+"""What an IMU says against itself: its yaw, and the integral of its rate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.doctor.fits import at_times, turned
+
+__all__ = ["ImuState", "compare_yaw_and_rate"]
+
+FloatArray = NDArray[np.float64]
+
+_WINDOW_S = 1.5
+_MIN_TURN_RAD = 0.5
+_SWING_S = 30.0
+_DEGREES = 180.0 / math.pi
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuState:
+    """Usable yaws (K,) by orientation and by rates, not wrapped; None where not filled.
+
+    ``ratio`` is how many times faster the rates turn than the orientation (-1: the other way;
+    57.3: in degrees), NaN where it cannot be told; ``swing_rad`` the largest change within 30 s
+    of the orientation against the rates, their constant difference taken off.
+    """
+
+    by_orientation: FloatArray | None
+    by_rates: FloatArray | None
+    is_orientation_constant: bool
+    are_rates_zero: bool
+    ratio: float
+    swing_rad: float
+
+
+def compare_yaw_and_rate(
+    imu_s: FloatArray, yaw_rad: FloatArray, yaw_rate_rad_s: FloatArray
+) -> ImuState:
+    """Compare yaw (K,) with yaw rate (K,), each NaN where not said, at times (K,) rising."""
+    has_yaw, has_rate = np.isfinite(yaw_rad), np.isfinite(yaw_rate_rad_s)
+    yaw = rates = None
+    if has_yaw.sum() > 10:
+        yaw = np.interp(imu_s, imu_s[has_yaw], np.unwrap(yaw_rad[has_yaw]))
+    if has_rate.sum() > 10:
+        rates = turned(imu_s, np.interp(imu_s, imu_s[has_rate], yaw_rate_rad_s[has_rate]))
+    is_constant = yaw is not None and bool(np.ptp(yaw) < 1e-6)
+    are_zero = rates is not None and not yaw_rate_rad_s[has_rate].any()
+    if is_constant and rates is not None and np.ptp(rates) < 1e-3:
+        is_constant = False  # it may really have stood still
+    if are_zero and (yaw is None or is_constant or np.ptp(yaw) < 0.1):
+        are_zero = False
+    by_yaw = None if is_constant else yaw
+    by_rates = None if are_zero else rates
+    ratio = swing_rad = math.nan
+    if by_yaw is not None and by_rates is not None:
+        ratio = _ratio(imu_s, by_yaw, by_rates)
+        if math.isfinite(ratio):
+            swing_rad = _swing(imu_s, by_yaw, by_rates / _nearest(ratio))
+    return ImuState(by_yaw, by_rates, is_constant, are_zero, ratio, swing_rad)
+
+
+def _nearest(ratio: float) -> float:
+    """The convention that a ratio stands for."""
+    known = (1.0, -1.0, _DEGREES, -_DEGREES)
+    return min(known, key=lambda value: abs(math.log(abs(ratio / value))) + (ratio * value < 0.0))
+
+
+def _ratio(imu_s: FloatArray, yaw: FloatArray, rates: FloatArray) -> float:
+    """Turn by rates over turn by yaw, in the median of windows that turn most."""
+    begin = np.arange(imu_s[0], imu_s[-1] - _WINDOW_S, 0.5 * _WINDOW_S)
+    first = at_times(begin, imu_s, yaw), at_times(begin, imu_s, rates)
+    last = at_times(begin + _WINDOW_S, imu_s, yaw), at_times(begin + _WINDOW_S, imu_s, rates)
+    by_yaw, by_rates = last[0] - first[0], last[1] - first[1]
+    usable = np.isfinite(by_yaw) & np.isfinite(by_rates)
+    by_yaw, by_rates = by_yaw[usable], by_rates[usable]
+    if len(by_yaw) < 8 or np.abs(by_yaw).sum() < _MIN_TURN_RAD:
+        return math.nan
+    most = np.abs(by_yaw) >= np.quantile(np.abs(by_yaw), 0.7)
+    ratios = by_rates[most] / by_yaw[most]
+    middle = float(np.median(ratios))
+    spread = float(np.median(np.abs(ratios - middle)))
+    return middle if middle and spread < 0.3 * abs(middle) else math.nan
+
+
+def _swing(imu_s: FloatArray, yaw: FloatArray, rates: FloatArray) -> float:
+    grid = np.arange(imu_s[0], imu_s[-1], 0.5)
+    difference = at_times(grid, imu_s, yaw - rates)
+    known = np.isfinite(difference)
+    if known.sum() < 20:
+        return math.nan
+    # The gyro's bias is a straight line, which a median of slopes finds beside a swing.
+    t, d = grid[known], difference[known]
+    half = len(t) // 2
+    slope = float(np.median((d[half:] - d[: len(d) - half]) / (t[half:] - t[: len(t) - half])))
+    d = d - slope * t
+    width = round(_SWING_S / 0.5)
+    spans = [np.ptp(d[i : i + width]) for i in range(0, max(1, len(d) - width // 2), 4)]
+    return float(max(spans))

@@ -1,0 +1,84 @@
+"""How the sonar moved from ping to ping, by its echoes alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.doctor.sample import PingSample
+from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["PingMotions", "ping_motions"]
+
+FloatArray = NDArray[np.float64]
+
+_SIGMAS_M = (0.48, 0.24, 0.12)
+_MIN_POINTS = 25
+_MAX_POINTS = 200
+_MIN_OVERLAP = 0.6
+_WINDOW_RAD = 0.6
+_MAX_SPEED_M_S = 2.5
+_SHARE = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PingMotions:
+    """Motions of the sonar: ``begin_s`` and ``end_s`` (M,), ``motion`` (M, 3) [x, y, yaw].
+
+    A motion is ``T_begin_end`` in the sonar's frame as the echoes have it; ``information``
+    (M, 3, 3) is nearly singular along directions that the echoes leave free.
+    """
+
+    begin_s: FloatArray
+    end_s: FloatArray
+    motion: FloatArray
+    information: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.begin_s)
+
+    def covariance(self, free_sigma: tuple[float, float, float] = (3.0, 3.0, 0.5)) -> FloatArray:
+        """Covariances (M, 3, 3); a free direction has `free_sigma` [m, m, rad]."""
+        weak = np.diag(1.0 / np.square(free_sigma))
+        return np.asarray(np.linalg.inv(self.information + weak))
+
+
+def ping_motions(pings: PingSample, min_gap_s: float, max_gap_s: float) -> PingMotions:
+    """Match each ping with the next one that is `min_gap_s` to `max_gap_s` later.
+
+    No navigation is used: the search reaches as far as a vehicle moves and turns in that time.
+    """
+    rows = []
+    for i, begin_s in enumerate(pings.stamp_s):
+        j = int(np.searchsorted(pings.stamp_s, begin_s + min_gap_s))
+        if j >= len(pings.stamp_s) or pings.stamp_s[j] - begin_s > max_gap_s:
+            continue
+        found = _match(pings.points[i], pings.points[j], float(pings.stamp_s[j] - begin_s))
+        if found is not None:
+            rows.append((begin_s, pings.stamp_s[j], *found))
+    return PingMotions(
+        np.array([row[0] for row in rows]),
+        np.array([row[1] for row in rows]),
+        np.array([row[2] for row in rows]).reshape(-1, 3),
+        np.array([row[3] for row in rows]).reshape(-1, 3, 3),
+    )
+
+
+def _match(
+    target: FloatArray, source: FloatArray, gap_s: float
+) -> tuple[FloatArray, FloatArray] | None:
+    if min(len(target), len(source)) < _MIN_POINTS:
+        return None
+    fields = [LikelihoodField(target, np.ones(len(target)), sigma) for sigma in _SIGMAS_M]
+    points, weight = thin(source, np.ones(len(source)), _SIGMAS_M[-1])
+    stride = -(-len(points) // _MAX_POINTS)
+    points, weight = points[::stride], np.minimum(weight[::stride], 1.0)
+    reach = min(_MAX_SPEED_M_S * gap_s, 4.0)
+    prior = Prior(SE2(), np.diag([reach**2, reach**2, _WINDOW_RAD**2]))
+    found = match_points(fields, points, weight, prior, (reach, reach, _WINDOW_RAD), _SHARE)
+    if found.overlap < _MIN_OVERLAP:
+        return None
+    return found.T_target_source.as_array(), found.information
