@@ -18,8 +18,10 @@ from uw_dslam_ros2.core.mounting import (
     rotation_of_quaternion,
 )
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar import Beams
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.readings import (
+    BeamsEvent,
     DepthEvent,
     FixEvent,
     ImageEvent,
@@ -38,7 +40,7 @@ FloatArray = NDArray[np.float64]
 
 SensorEvent = Reading
 
-_PINGS = (ImageEvent, ScanEvent, PointsEvent)
+_PINGS = (ImageEvent, ScanEvent, PointsEvent, BeamsEvent)
 _HOLD_NS = 2_000_000_000
 
 
@@ -164,6 +166,13 @@ def feed(mapper: VehicleMapper, event: SensorEvent, T_base_sensor: FloatArray) -
             )  # fmt: skip
         case PointsEvent():
             return _feed_points(mapper, event, T_base_sensor, R_level_base)
+        case BeamsEvent():
+            mount = fan_mount(T_base_sensor, "x", R_level_base)
+            beams = Beams(
+                event.beam_stamp_ns, event.bearing_rad, event.range_m, event.range_max_m,
+                event.intensity,
+            )  # fmt: skip
+            return mapper.add_beams(beams, mount.T_base_fan, mount.projection)
         case VelocityEvent():
             _feed_velocity(mapper, event, T_base_sensor, R_level_base)
         case ImuEvent():

@@ -12,6 +12,7 @@ from uw_dslam_ros2.core.mapping.config import SubmapConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.matcher import thin
 from uw_dslam_ros2.core.mapping.occupancy import CompressedGrid, GrowingGrid
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar.turning import PlacedSweep
 from uw_dslam_ros2.core.sonar.types import Detections
 from uw_dslam_ros2.core.submap import Submap
 
@@ -99,19 +100,32 @@ class OpenSection:
     def add(self, detections: Detections, T_submap_base: SE2, T_base_sonar: SE2) -> None:
         """Add one ping; it enters the grid only some distance, turn or time after the last."""
         stamp_ns = detections.stamp_ns
+        self._go_on(stamp_ns, T_submap_base)
+        self.num_pings += 1
+        if self._is_due(stamp_ns, T_submap_base):
+            self._last_mapped = (stamp_ns, T_submap_base)
+            self._draw(detections, T_submap_base @ T_base_sonar)
+
+    def add_sweep(self, sweep: PlacedSweep, T_submap_reference: SE2) -> None:
+        """Add a sweep of a sonar that turns: all its beams, each from its own place."""
+        for stamp_ns, pose in zip(sweep.stamps_ns, sweep.path, strict=True):
+            self._go_on(int(stamp_ns), T_submap_reference @ SE2.from_array(pose))
+        self.num_pings += 1
+        for part in sweep.slices:
+            self._draw(part.detections, T_submap_reference @ part.T_reference_sonar)
+
+    def _go_on(self, stamp_ns: int, T_submap_base: SE2) -> None:
         if self._trajectory:
             x, y, _ = self._trajectory[-1]
             self._length_m += math.hypot(T_submap_base.x - x, T_submap_base.y - y)
         self._trajectory.append((T_submap_base.x, T_submap_base.y, T_submap_base.yaw))
         self._stamps_ns.append(stamp_ns)
-        self.num_pings += 1
-        if self._is_due(stamp_ns, T_submap_base):
-            self._last_mapped = (stamp_ns, T_submap_base)
-            T_submap_sonar = T_submap_base @ T_base_sonar
-            self.grid.add(detections, T_submap_sonar)
-            if len(detections.points):
-                self._points.append(T_submap_sonar.apply(detections.points))
-                self._weight.append(detections.weight)
+
+    def _draw(self, detections: Detections, T_submap_sonar: SE2) -> None:
+        self.grid.add(detections, T_submap_sonar)
+        if len(detections.points):
+            self._points.append(T_submap_sonar.apply(detections.points))
+            self._weight.append(detections.weight)
 
     def should_close(self, stamp_ns: int, sigma_m: float) -> bool:
         """Whether it has become long, old or uncertain enough."""

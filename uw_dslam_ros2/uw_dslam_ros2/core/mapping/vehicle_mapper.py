@@ -20,12 +20,17 @@ from uw_dslam_ros2.core.navigation.pose_differences import PoseDifferences
 from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
+    BeamGatherer,
+    Beams,
     Detections,
+    PlacedSweep,
     SonarImage,
     detect,
     detections_from_points,
     detections_from_scan,
+    place_sweep,
 )
+from uw_dslam_ros2.core.sonar.turning import Sweep
 from uw_dslam_ros2.core.submap import Submap
 
 __all__ = ["VehicleMapper"]
@@ -35,6 +40,10 @@ _REISSUE_M, _REISSUE_RAD = 0.02, 0.002
 """A submap that moved by more is given away again."""
 _ATTITUDE_NS = 500_000_000
 """A vehicle rolls and pitches within seconds: older angles are not used."""
+_TURN_MEMORY_S = 120.0
+"""A turn takes up to 35 s, and its message may come when the next one is complete."""
+_AHEAD_NS = 1_000_000_000
+"""At the end, beams this much newer than all navigation are placed by its last velocity."""
 _MIN_OVERLAP = 0.3
 """Least share of a ping's echoes that must meet known ones for a match to be believed."""
 
@@ -68,6 +77,9 @@ class VehicleMapper:
         self._velocity_ns: int | None = None
         self._pose_differences = PoseDifferences()
         self._attitude: tuple[int, FloatArray | None] = (0, None)
+        self._gatherer = BeamGatherer()
+        # Until it is known what kind of sonar there is.
+        self._navigation.remember(_TURN_MEMORY_S)
 
     # --- navigation in
     # -------------------------------------------------------------------------------------------
@@ -162,12 +174,25 @@ class VehicleMapper:
         found = detections_from_points(stamp_ns, points, self._config.sonar)
         return self._add(found, T_base_sonar, projection)
 
+    def add_beams(
+        self, beams: Beams, T_base_sonar: SE2, projection: FloatArray | None = None
+    ) -> list[Submap]:
+        """Beams of a sonar that turns, each with its own time.
+
+        They are mapped once their sweep is complete and navigation has come to its end.
+        """
+        self._gatherer.add(beams, T_base_sonar, projection)
+        self._counts["num_beams_dropped"] = self._gatherer.num_late
+        newest_ns = self._navigation.stamp_ns
+        return [] if newest_ns is None else self._add_sweeps(self._gatherer.take(newest_ns))
+
     def finish(self) -> list[Submap]:
         """Close the open submap, and settle the graph; no ping may follow."""
+        issued = self._add_sweeps(self._gatherer.take(None))
         if self._open is None:
-            return []
+            return issued
         last_ns = int(self._open.stamps_ns[-1])
-        return self._close(self._navigation.relative_at(last_ns)[1])
+        return issued + self._close(self._navigation.relative_at(last_ns)[1])
 
     # --- results
     # ----------------
@@ -279,7 +304,11 @@ class VehicleMapper:
     # ----------------
 
     def _add(
-        self, detections: Detections, T_base_sonar: SE2, projection: FloatArray | None = None
+        self,
+        detections: Detections,
+        T_base_sonar: SE2,
+        projection: FloatArray | None = None,
+        sweep: PlacedSweep | None = None,
     ) -> list[Submap]:
         if projection is not None:
             detections = detections.projected(projection)
@@ -287,13 +316,38 @@ class VehicleMapper:
         if is_old or not self._navigation.is_started:
             self._count("num_pings_dropped")
             return []
+        if self._last_ping_ns is None:
+            self._navigation.remember(0.0 if sweep is None else _TURN_MEMORY_S)
         self._last_ping_ns = detections.stamp_ns
-        return self._process(detections, T_base_sonar)
+        return self._process(detections, T_base_sonar, sweep)
+
+    def _add_sweeps(self, sweeps: list[Sweep]) -> list[Submap]:
+        issued: list[Submap] = []
+        navigation = self._navigation
+        for whole in sweeps:
+            oldest_ns, newest_ns = navigation.oldest_ns, navigation.stamp_ns
+            if oldest_ns is None or newest_ns is None:
+                self._count("num_pings_dropped")
+                continue
+            sweep = whole.since(oldest_ns).until(newest_ns + _AHEAD_NS)
+            if not sweep.beams:
+                self._count("num_pings_dropped")
+                continue
+            stamps_ns = sweep.stamp_ns
+            # Of the middle beam: the others are placed relative to it, the farther the less sure.
+            stamp_ns = int(stamps_ns[len(stamps_ns) // 2])
+            T_base_odom = navigation.pose_at(stamp_ns)[0].inverse()
+            poses = [T_base_odom @ navigation.pose_at(int(t))[0] for t in stamps_ns]
+            placed = place_sweep(sweep, poses, stamp_ns, self._config.sonar)
+            issued += self._add(placed.detections, SE2(), sweep=placed)
+        return issued
 
     def _count(self, name: str) -> None:
         self._counts[name] = int(self._counts[name]) + 1
 
-    def _process(self, detections: Detections, T_base_sonar: SE2) -> list[Submap]:
+    def _process(
+        self, detections: Detections, T_base_sonar: SE2, sweep: PlacedSweep | None
+    ) -> list[Submap]:
         issued: list[Submap] = []
         stamp_ns = detections.stamp_ns
         self._count("num_pings")
@@ -310,7 +364,10 @@ class VehicleMapper:
             issued = self._close(covariance)
             self._begin(stamp_ns, T_submap_base, covariance)
             T_submap_base = SE2()
-        self._open.add(detections, T_submap_base, T_base_sonar)
+        if sweep is None:
+            self._open.add(detections, T_submap_base, T_base_sonar)
+        else:
+            self._open.add_sweep(sweep, T_submap_base)
         return issued
 
     def _begin(

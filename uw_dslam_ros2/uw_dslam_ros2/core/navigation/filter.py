@@ -64,6 +64,7 @@ class NavigationFilter:
         ])  # fmt: skip
         self._early: list[tuple[_Key, Event]] | None = []
         self._records: list[_Record] = []
+        self._memory_s = config.horizon_s
         self.num_late = 0
         self.num_invalid = 0
         self.num_outliers = 0
@@ -77,6 +78,15 @@ class NavigationFilter:
     def stamp_ns(self) -> int | None:
         """Time of the newest event that has been applied; None before the start."""
         return self._records[-1].key[0] if self._records else None
+
+    @property
+    def oldest_ns(self) -> int | None:
+        """From when on poses are known; None before the start."""
+        return self._records[0].key[0] if self._records else None
+
+    def remember(self, span_s: float) -> None:
+        """Know poses, and take late messages, for so long from now on; at least the horizon."""
+        self._memory_s = max(self._config.horizon_s, span_s)
 
     def add_yaw(self, stamp_ns: int, yaw_rad: float, sigma_rad: float | None = None) -> None:
         """Yaw of base_link [rad], counter-clockwise.
@@ -294,7 +304,7 @@ class NavigationFilter:
         return self._predicted(self._records[max(position - 1, 0)], stamp_ns)
 
     def _forget(self) -> None:
-        limit_ns = self._records[-1].key[0] - int(self._config.horizon_s * 1e9)
+        limit_ns = self._records[-1].key[0] - int(self._memory_s * 1e9)
         position = bisect.bisect_left(self._records, limit_ns, key=lambda record: record.key[0])
         # In steps, so that the list is not moved for every message.
         if position > 64:

@@ -2,13 +2,18 @@
 
 from uw_dslam_ros2.core.sonar.config import SonarConfig
 from uw_dslam_ros2.core.sonar.detect import detect, detections_from_points, detections_from_scan
+from uw_dslam_ros2.core.sonar.turning import BeamGatherer, Beams, PlacedSweep, place_sweep
 from uw_dslam_ros2.core.sonar.types import Detections, SonarImage
 
 __all__ = [
+    "BeamGatherer",
+    "Beams",
     "Detections",
+    "PlacedSweep",
     "SonarConfig",
     "SonarImage",
     "detect",
     "detections_from_points",
     "detections_from_scan",
+    "place_sweep",
 ]

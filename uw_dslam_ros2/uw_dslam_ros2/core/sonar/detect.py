@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -17,7 +19,17 @@ from uw_dslam_ros2.core.sonar.kernels import (
 )
 from uw_dslam_ros2.core.sonar.types import Detections, SonarImage
 
-__all__ = ["detect", "detections_from_points", "detections_from_scan"]
+__all__ = [
+    "BeamEchoes",
+    "beam_spacing",
+    "detect",
+    "detections_from_points",
+    "detections_from_scan",
+    "has_neighbors",
+    "image_echoes",
+    "polar",
+    "scan_echoes",
+]
 
 FloatArray = NDArray[np.float64]
 _MODES = {"first": 0, "strongest": 1, "all": 2}
@@ -46,45 +58,7 @@ def detect(image: SonarImage, config: SonarConfig = SonarConfig()) -> Detections
     InvalidInputError
         Ranges that do not rise, bearings or intensities that are not finite.
     """
-    range_m, bearing_rad = _checked_axes(image)
-    beamwidth_rad = _beamwidth(bearing_rad, config)
-    first, last = np.searchsorted(range_m, [config.min_range_m, config.max_range_m], side="left")
-    bin_m = float(np.median(np.diff(range_m))) if len(range_m) > 1 else 0.0
-    range_sigma_m = float(np.hypot(config.range_sigma_m, bin_m / np.sqrt(12.0)))
-    if last <= first:
-        nothing = np.empty(0)
-        return Detections(
-            image.stamp_ns, np.empty((0, 2)), nothing, bearing_rad, np.zeros(len(bearing_rad)),
-            beamwidth_rad, range_sigma_m,
-        )  # fmt: skip
-    power = to_power(
-        np.ascontiguousarray(image.intensity), config.intensity == "amplitude", first, last
-    )
-    if not np.isfinite(power[:, :].sum(dtype=np.float64)):
-        raise InvalidInputError("intensity holds values that are not finite")
-    ratio = _threshold_ratio(power, _full_scale(image.intensity.dtype), config)
-    gap_bins = config.min_separation_m / bin_m if bin_m > 0.0 else 1.0
-    beams, bins, strengths, first_above = select_returns(
-        power, ratio, _MODES[config.returns], gap_bins
-    )
-    echo_range_m = np.interp(first + bins, np.arange(len(range_m)), range_m)
-    points = _polar(echo_range_m, bearing_rad[beams])
-    keep = has_neighbors(points, beamwidth_rad, config)
-    # What the filter threw away was an echo of something: the water behind it stays unknown.
-    free_range_m = np.where(
-        first_above >= 0,
-        range_m[first + np.maximum(first_above, 0)] - 0.5 * bin_m,
-        _NO_ECHO_FREE_SHARE * range_m[last - 1],
-    )
-    return Detections(
-        image.stamp_ns,
-        points[keep],
-        np.clip(1.0 - 1.0 / strengths[keep], _MIN_WEIGHT, 1.0),
-        bearing_rad,
-        np.maximum(free_range_m, 0.0),
-        beamwidth_rad,
-        range_sigma_m,
-    )
+    return _unmoved(image.stamp_ns, image.bearing_rad, image_echoes(image, config), config)
 
 
 def detections_from_scan(
@@ -100,34 +74,8 @@ def detections_from_scan(
     Infinity says that the beam met nothing, so the water is free for half of
     `range_max_m`; NaN says nothing.
     """
-    bearing = np.asarray(angles_rad, dtype=np.float64)
-    ranges = np.asarray(ranges_m, dtype=np.float64)
-    if bearing.ndim != 1 or bearing.shape != ranges.shape or len(bearing) == 0:
-        raise InvalidInputError(
-            f"angles have shape {bearing.shape} and ranges {ranges.shape}, expected the same (B "
-            f"> 0,)"
-        )
-    if not np.isfinite(bearing).all():
-        raise InvalidInputError("angles hold values that are not finite")
-    if not (np.isfinite(range_max_m) and range_max_m > 0.0):
-        raise InvalidInputError(f"range_max_m is {range_max_m}, expected a positive number")
-    limit = min(range_max_m, config.max_range_m)
-    is_echo = np.isfinite(ranges) & (ranges >= config.min_range_m) & (ranges < limit)
-    points = _polar(ranges[is_echo], bearing[is_echo])
-    beamwidth_rad = _beamwidth(bearing, config)
-    keep = has_neighbors(points, beamwidth_rad, config)
-    free = np.zeros(len(bearing))
-    free[is_echo] = ranges[is_echo]
-    met_nothing = (ranges >= limit) & ~np.isnan(ranges)
-    free[met_nothing] = _NO_ECHO_FREE_SHARE * limit
-    return Detections(
-        stamp_ns,
-        points[keep],
-        np.ones(int(keep.sum())),
-        bearing,
-        free,
-        beamwidth_rad,
-        config.range_sigma_m,
+    return _unmoved(
+        stamp_ns, angles_rad, scan_echoes(angles_rad, ranges_m, range_max_m, config), config
     )
 
 
@@ -167,17 +115,120 @@ def detections_from_points(
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BeamEchoes:
+    """Echoes before any filter that looks beyond one beam, and what each beam says of the water.
+
+    ``beam`` (N,) of each echo, ``range_m`` (N,), ``weight`` (N,) in (0, 1]; ``free_range_m`` (B,).
+    """
+
+    beam: NDArray[np.int64]
+    range_m: FloatArray
+    weight: FloatArray
+    free_range_m: FloatArray
+    range_sigma_m: float
+
+
+def image_echoes(image: SonarImage, config: SonarConfig) -> BeamEchoes:
+    """Echoes along each beam of an image; raises as `detect` does."""
+    range_m, bearing_rad = _checked_axes(image)
+    first, last = np.searchsorted(range_m, [config.min_range_m, config.max_range_m], side="left")
+    bin_m = float(np.median(np.diff(range_m))) if len(range_m) > 1 else 0.0
+    range_sigma_m = float(np.hypot(config.range_sigma_m, bin_m / np.sqrt(12.0)))
+    if last <= first:
+        nothing = np.empty(0)
+        return BeamEchoes(
+            np.empty(0, np.int64), nothing, nothing, np.zeros(len(bearing_rad)), range_sigma_m
+        )
+    power = to_power(
+        np.ascontiguousarray(image.intensity), config.intensity == "amplitude", first, last
+    )
+    if not np.isfinite(power[:, :].sum(dtype=np.float64)):
+        raise InvalidInputError("intensity holds values that are not finite")
+    ratio = _threshold_ratio(power, _full_scale(image.intensity.dtype), config)
+    gap_bins = config.min_separation_m / bin_m if bin_m > 0.0 else 1.0
+    beams, bins, strengths, first_above = select_returns(
+        power, ratio, _MODES[config.returns], gap_bins
+    )
+    # What a later filter throws away was an echo of something: the water behind stays unknown.
+    free_range_m = np.where(
+        first_above >= 0,
+        range_m[first + np.maximum(first_above, 0)] - 0.5 * bin_m,
+        _NO_ECHO_FREE_SHARE * range_m[last - 1],
+    )
+    return BeamEchoes(
+        beams,
+        np.interp(first + bins, np.arange(len(range_m)), range_m),
+        np.clip(1.0 - 1.0 / strengths, _MIN_WEIGHT, 1.0),
+        np.maximum(free_range_m, 0.0),
+        range_sigma_m,
+    )
+
+
+def scan_echoes(
+    angles_rad: ArrayLike, ranges_m: ArrayLike, range_max_m: ArrayLike, config: SonarConfig
+) -> BeamEchoes:
+    """Echoes of beams with one range each; ``range_max_m`` is a number or one of each beam (B,).
+
+    Raises as `detections_from_scan` does.
+    """
+    bearing = np.asarray(angles_rad, dtype=np.float64)
+    ranges = np.asarray(ranges_m, dtype=np.float64)
+    range_max = np.asarray(range_max_m, dtype=np.float64)
+    if bearing.ndim != 1 or bearing.shape != ranges.shape or len(bearing) == 0:
+        raise InvalidInputError(
+            f"angles have shape {bearing.shape} and ranges {ranges.shape}, expected the same (B "
+            f"> 0,)"
+        )
+    if not np.isfinite(bearing).all():
+        raise InvalidInputError("angles hold values that are not finite")
+    if not (np.isfinite(range_max) & (range_max > 0.0)).all():
+        raise InvalidInputError(f"range_max_m is {range_max}, expected a positive number")
+    limit = np.broadcast_to(np.minimum(range_max, config.max_range_m), ranges.shape)
+    is_echo = np.isfinite(ranges) & (ranges >= config.min_range_m) & (ranges < limit)
+    free = np.zeros(len(bearing))
+    free[is_echo] = ranges[is_echo]
+    met_nothing = (ranges >= limit) & ~np.isnan(ranges)
+    free[met_nothing] = _NO_ECHO_FREE_SHARE * limit[met_nothing]
+    beam = np.flatnonzero(is_echo)
+    return BeamEchoes(beam, ranges[beam], np.ones(len(beam)), free, config.range_sigma_m)
+
+
+def _unmoved(
+    stamp_ns: int, bearing_rad: ArrayLike, echoes: BeamEchoes, config: SonarConfig
+) -> Detections:
+    """Detections of beams that were all heard at one place."""
+    bearing = np.asarray(bearing_rad, dtype=np.float64)
+    beamwidth_rad = beam_spacing(bearing, config)
+    points = polar(echoes.range_m, bearing[echoes.beam])
+    keep = has_neighbors(points, beamwidth_rad, config)
+    return Detections(
+        stamp_ns,
+        points[keep],
+        echoes.weight[keep],
+        bearing,
+        echoes.free_range_m,
+        beamwidth_rad,
+        echoes.range_sigma_m,
+    )
+
+
 def has_neighbors(
-    points: FloatArray, beamwidth_rad: float, config: SonarConfig
+    points: FloatArray,
+    beamwidth_rad: float,
+    config: SonarConfig,
+    range_m: FloatArray | None = None,
 ) -> NDArray[np.bool_]:
     """Distance-constrained filter: which points (N, 2) have `min_neighbors` others near them.
 
     Beams spread, so the reach grows by the distance between two neighbouring beams at the point's
-    range.
+    range (N,): from the frame's zero unless it is given.
     """
     if config.neighbor_distance_m <= 0.0 or len(points) == 0:
         return np.ones(len(points), np.bool_)
-    reach = config.neighbor_distance_m + beamwidth_rad * np.hypot(points[:, 0], points[:, 1])
+    if range_m is None:
+        range_m = np.hypot(points[:, 0], points[:, 1])
+    reach = config.neighbor_distance_m + beamwidth_rad * range_m
     order = np.argsort(points[:, 0], kind="stable")
     counts = np.empty(len(points), np.int64)
     counts[order] = neighbor_counts(points[order], reach[order])
@@ -198,10 +249,12 @@ def _checked_axes(image: SonarImage) -> tuple[FloatArray, FloatArray]:
     return range_m, bearing_rad
 
 
-def _beamwidth(bearing_rad: FloatArray, config: SonarConfig) -> float:
+def beam_spacing(bearing_rad: FloatArray, config: SonarConfig) -> float:
+    """Width of a beam [rad], as set or as wide as the beams (B,) lie apart."""
     if config.beamwidth_rad > 0.0 or len(bearing_rad) < 2:
         return config.beamwidth_rad or 0.02
-    return float(np.median(np.abs(np.diff(bearing_rad))))
+    steps = np.abs(np.diff(bearing_rad))
+    return float(np.median(np.minimum(steps, np.abs(2.0 * np.pi - steps))))
 
 
 def _full_scale(dtype: np.dtype[np.generic]) -> float:
@@ -226,5 +279,6 @@ def _threshold_ratio(
     return cfar_ratio(power, num_train, config.num_guard_cells, factors, so_factor, floor)
 
 
-def _polar(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
+def polar(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
+    """Points (N, 2)."""
     return np.column_stack([range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)])
