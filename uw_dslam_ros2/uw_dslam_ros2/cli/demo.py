@@ -31,7 +31,7 @@ from uw_dslam_ros2.core.merging import MapQueueConfig
 from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
 from uw_dslam_ros2.io.session import load_session
 from uw_dslam_ros2.io.settings import SettingsFile
-from uw_dslam_ros2.sim.mission import MissionConfig
+from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
 from uw_dslam_ros2.sim.recording import simulate_mission
 
 __all__ = ["main"]
@@ -81,6 +81,12 @@ def _parser() -> argparse.ArgumentParser:
         default=MissionConfig().duration_s,
         metavar="S",
         help="length of each recording [s] (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--sonar",
+        choices=SONAR_KINDS,
+        default=MissionConfig().sonar_kind,
+        help="a fan of beams at once, or one beam that turns in 14 s",
     )
     parser.add_argument(
         "--rate",
@@ -192,7 +198,10 @@ def _prepared(out: Path) -> Path:
 
 def _simulate(args: argparse.Namespace, out: Path, steps: _Steps) -> _Recordings:
     config = MissionConfig(
-        seed=args.seed, num_vehicles=args.vehicles, duration_s=float(args.duration)
+        seed=args.seed,
+        num_vehicles=args.vehicles,
+        duration_s=float(args.duration),
+        sonar_kind=args.sonar,
     )
     steps.begin(
         "simulating",
@@ -210,7 +219,7 @@ def _simulate(args: argparse.Namespace, out: Path, steps: _Steps) -> _Recordings
         mission.vehicle_ids,
         mission.bags,
         read_truth(mission.truth_map.parent),
-        "sonar",
+        "scan" if config.is_turning else "sonar",
         args.config,
         {"mission": config.seed},
     )

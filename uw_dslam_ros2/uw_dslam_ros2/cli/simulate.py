@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from uw_dslam_ros2.core.errors import UwDslamError
 from uw_dslam_ros2.sim.instruments import HEADING_SOURCES
-from uw_dslam_ros2.sim.mission import MissionConfig
+from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
 from uw_dslam_ros2.sim.places import PLACES
 from uw_dslam_ros2.sim.recording import simulate_mission
 
@@ -35,10 +35,24 @@ def _parser() -> argparse.ArgumentParser:
         default=default.overlap,
         help="part of an area's width that the next vehicle surveys too",
     )
+    parser.add_argument(
+        "--sonar",
+        choices=SONAR_KINDS,
+        default=default.sonar_kind,
+        help="a fan of beams at once, or one beam that turns in 14 s",
+    )
+    parser.add_argument(
+        "--message",
+        choices=("beam", "turn"),
+        default=default.turning.message,
+        help="what a LaserScan of a turning sonar holds",
+    )
     parser.add_argument("--ping-rate", type=float, default=default.ping_rate_hz, metavar="HZ")
     parser.add_argument("--beams", type=int, default=default.sonar.num_beams)
     parser.add_argument("--ranges", type=int, default=default.sonar.num_ranges, help="range bins")
-    parser.add_argument("--max-range", type=float, default=default.sonar.max_range_m, metavar="M")
+    parser.add_argument(
+        "--max-range", type=float, metavar="M", help="default: 40, of a turning sonar 30"
+    )
     parser.add_argument("--speed", type=float, default=default.drive.speed_m_s, metavar="M/S")
     parser.add_argument("--heading", choices=HEADING_SOURCES, default="gyro")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
@@ -62,7 +76,13 @@ def _config(arguments: argparse.Namespace) -> MissionConfig:
             default.sonar,
             num_beams=arguments.beams,
             num_ranges=arguments.ranges,
-            max_range_m=arguments.max_range,
+            max_range_m=arguments.max_range or default.sonar.max_range_m,
+        ),
+        sonar_kind=arguments.sonar,
+        turning=replace(
+            default.turning,
+            message=arguments.message,
+            max_range_m=arguments.max_range or default.turning.max_range_m,
         ),
         drive=replace(default.drive, speed_m_s=arguments.speed),
         instruments=replace(default.instruments, heading_source=arguments.heading),

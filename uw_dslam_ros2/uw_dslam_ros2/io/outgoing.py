@@ -233,6 +233,33 @@ class MessageFactory:
             is_dense=True,
         )
 
+    def laser_scan(
+        self,
+        stamp_ns: int,
+        frame_id: str,
+        *,
+        angle_min_rad: float,
+        angle_increment_rad: float,
+        time_increment_s: float,
+        ranges_m: ArrayLike,
+        range_limits_m: tuple[float, float],
+    ) -> Any:
+        """``sensor_msgs/LaserScan`` of ranges (N,) [m]; the stamp is the first beam's."""
+        ranges = np.asarray(ranges_m, dtype=np.float32)
+        return self.make(
+            "sensor_msgs/msg/LaserScan",
+            header=self.header(stamp_ns, frame_id),
+            angle_min=angle_min_rad,
+            angle_max=angle_min_rad + angle_increment_rad * (len(ranges) - 1),
+            angle_increment=angle_increment_rad,
+            time_increment=time_increment_s,
+            scan_time=time_increment_s * len(ranges),
+            range_min=range_limits_m[0],
+            range_max=range_limits_m[1],
+            ranges=ranges,
+            intensities=np.empty(0, np.float32),
+        )
+
     def odometry(
         self,
         stamp_ns: int,

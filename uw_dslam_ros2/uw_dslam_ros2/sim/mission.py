@@ -17,10 +17,12 @@ from uw_dslam_ros2.sim.instruments import InstrumentConfig, NavigationLog, measu
 from uw_dslam_ros2.sim.paths import SurveyArea, plan_survey, split_areas
 from uw_dslam_ros2.sim.places import PLACES, make_place
 from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
+from uw_dslam_ros2.sim.turning import TurningSonarConfig, TurningSonarSimulator
 from uw_dslam_ros2.sim.vehicle import DriveConfig, Motion, drive
 from uw_dslam_ros2.sim.world import World
 
 __all__ = [
+    "SONAR_KINDS",
     "T_BASE_DVL",
     "T_BASE_SONAR",
     "Mission",
@@ -43,6 +45,9 @@ T_BASE_SONAR = SE2(0.30, 0.0, 0.0)
 T_BASE_DVL = SE2(-0.10, 0.05, 0.0)
 """Where the DVL sits."""
 
+SONAR_KINDS = ("imaging", "turning")
+"""A fan of beams at once, or one beam that turns."""
+
 
 @dataclass(frozen=True, slots=True)
 class MissionConfig(Config):
@@ -57,12 +62,33 @@ class MissionConfig(Config):
         0.3, 0.0, 0.95, "part of an area's width that the next vehicle surveys too"
     )
     clearance_m: float = setting(4.0, 1.0, 20.0, "distance kept from walls [m]")
-    ping_rate_hz: float = setting(3.0, 0.2, 30.0, "sonar pings per second")
+    sonar_kind: str = setting("imaging", choices=SONAR_KINDS, doc="what the vehicles carry")
+    ping_rate_hz: float = setting(3.0, 0.2, 30.0, "imaging: sonar pings per second")
     truth_resolution_m: float = setting(0.05, 0.01, 2.0, "cell size of the true map [m]")
     sonar: SonarConfig = setting(SonarConfig())
+    turning: TurningSonarConfig = setting(TurningSonarConfig())
     drive: DriveConfig = setting(DriveConfig())
     instruments: InstrumentConfig = setting(InstrumentConfig())
     clutter: ClutterConfig = setting(ClutterConfig())
+
+    @property
+    def is_turning(self) -> bool:
+        """Whether a ping is one beam of a sonar that turns."""
+        return self.sonar_kind == "turning"
+
+    @property
+    def ping_interval_ns(self) -> int:
+        """Time from ping to ping."""
+        if self.is_turning:
+            return round(_NS * self.turning.interval_s)
+        return round(_NS / self.ping_rate_hz)
+
+    @property
+    def field_of_view(self) -> tuple[float, float]:
+        """What the sonar sees in the end: angle [rad] and range [m]."""
+        if self.is_turning:
+            return 2.0 * math.pi, self.turning.max_range_m
+        return self.sonar.fov_rad, self.sonar.max_range_m
 
 
 def tiny_mission_config(seed: int = 0) -> MissionConfig:
@@ -135,7 +161,7 @@ def _run(config: MissionConfig, world: World, area: SurveyArea, index: int) -> V
     motion = drive(route, start_ns, config.duration_s, config.drive, rng)
     log = measure(motion, config.instruments, T_BASE_DVL, rng, world)
     first = start_ns + int(rng.integers(50_000_000, 150_000_000))
-    pings = np.arange(first, motion.stamp_ns[-1], round(_NS / config.ping_rate_hz))
+    pings = np.arange(first, motion.stamp_ns[-1], config.ping_interval_ns)
     sonar = config.sonar
     return VehicleRun(
         vehicle_id=f"auv_{index + 1}",
@@ -153,24 +179,28 @@ class PingMaker:
 
     def __init__(self, mission: Mission) -> None:
         self._mission = mission
-        self._sonars = [
-            SonarSimulator(mission.world, mission.config.sonar, run.range_scale)
-            for run in mission.runs
-        ]
+        config, world = mission.config, mission.world
+        self._fans: list[SonarSimulator] = []
+        self._turning: list[TurningSonarSimulator] = []
+        for run in mission.runs:
+            if config.is_turning:
+                sonar = TurningSonarSimulator(world, config.turning, config.sonar, run.range_scale)
+                self._turning.append(sonar)
+            else:
+                self._fans.append(SonarSimulator(world, config.sonar, run.range_scale))
         self._clutter = MovingClutter(mission.world, mission.config.clutter)
 
     def ping(self, vehicle: int, index: int) -> SonarImage:
-        """Return the image of one ping."""
+        """Return the image of one ping: of one beam where the sonar turns."""
         run = self._mission.runs[vehicle]
         motion, stamp_ns = run.ping_motion, int(run.ping_motion.stamp_ns[index])
         rng = np.random.default_rng([self._mission.config.seed, 20, vehicle, index])
-        return self._sonars[vehicle].ping(
-            stamp_ns,
-            motion.pose(index) @ run.T_base_sonar,
-            float(motion.depth_m[index]),
-            rng,
-            self._clutter.at((stamp_ns - _START_NS) / _NS),
-        )
+        place = motion.pose(index) @ run.T_base_sonar
+        depth_m = float(motion.depth_m[index])
+        clutter = self._clutter.at((stamp_ns - _START_NS) / _NS)
+        if self._mission.config.is_turning:
+            return self._turning[vehicle].beam(stamp_ns, index, place, depth_m, rng, clutter)
+        return self._fans[vehicle].ping(stamp_ns, place, depth_m, rng, clutter)
 
     def pings(self, vehicle: int, indices: range) -> Iterator[SonarImage]:
         """Images of several pings of one vehicle."""

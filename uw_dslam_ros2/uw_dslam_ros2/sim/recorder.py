@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from uw_dslam_ros2.core.sonar.config import SonarConfig
+from uw_dslam_ros2.core.sonar.detect import image_echoes
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.recordings import BagWriter
@@ -39,7 +41,11 @@ class VehicleRecorder:
         who = run.vehicle_id
         self._base, self._sonar = f"{who}/base_link", f"{who}/sonar"
         writer.add_topic("/tf_static", "tf2_msgs/msg/TFMessage", is_latched=True)
-        writer.add_topic(f"/{who}/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+        self._beams: list[SonarImage] = []
+        if self._config.is_turning:
+            writer.add_topic(f"/{who}/scan", "sensor_msgs/msg/LaserScan")
+        else:
+            writer.add_topic(f"/{who}/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
         writer.add_topic(f"/{who}/imu", "sensor_msgs/msg/Imu")
         writer.add_topic(f"/{who}/dvl", "marine_acoustic_msgs/msg/Dvl")
         writer.add_topic(f"/{who}/depth", "sensor_msgs/msg/FluidPressure")
@@ -61,8 +67,10 @@ class VehicleRecorder:
 
     def _mounts(self, stamp_ns: int) -> Any:
         who = self._run.vehicle_id
+        # A scan's axes are x ahead, y to port.
+        rotation = _NO_ROTATION if self._config.is_turning else _SONAR_ROTATION
         mounts = [
-            (f"{who}/sonar", (T_BASE_SONAR.x, T_BASE_SONAR.y, -0.10), _SONAR_ROTATION),
+            (f"{who}/sonar", (T_BASE_SONAR.x, T_BASE_SONAR.y, -0.10), rotation),
             (f"{who}/dvl", (T_BASE_DVL.x, T_BASE_DVL.y, -0.15), _DVL_ROTATION),
             (f"{who}/imu", (0.0, 0.0, 0.0), _NO_ROTATION),
             (f"{who}/depth", (0.0, 0.0, 0.0), _NO_ROTATION),
@@ -75,8 +83,38 @@ class VehicleRecorder:
             stamp, kind, index = self._pending.pop()
             self._writers[kind](stamp, index)
 
-    def write_image(self, image: SonarImage) -> None:
-        """Write one ping."""
+    def write_ping(self, image: SonarImage) -> None:
+        """Write one ping; of a sonar that turns, once its message is complete."""
+        if not self._config.is_turning:
+            self._write_image(image)
+            return
+        self._beams.append(image)
+        turning = self._config.turning
+        if len(self._beams) < (turning.num_beams if turning.message == "turn" else 1):
+            return
+        self._write_scan(self._beams)
+        self._beams = []
+
+    def _write_scan(self, beams: list[SonarImage]) -> None:
+        """First echoes, as a driver finds them; stamped with the first beam's time."""
+        turning = self._config.turning
+        ranges = np.full(len(beams), np.inf)
+        for i, beam in enumerate(beams):
+            found = image_echoes(beam, SonarConfig())
+            if len(found.range_m):
+                ranges[i] = found.range_m[0]
+        message = self._make.laser_scan(
+            beams[0].stamp_ns,
+            self._sonar,
+            angle_min_rad=float(beams[0].bearing_rad[0]),
+            angle_increment_rad=2.0 * math.pi / turning.num_beams,
+            time_increment_s=turning.interval_s,
+            ranges_m=ranges,
+            range_limits_m=(self._config.sonar.min_range_m, turning.max_range_m),
+        )
+        self._writer.write(f"/{self._run.vehicle_id}/scan", beams[-1].stamp_ns, message)
+
+    def _write_image(self, image: SonarImage) -> None:
         message = self._make.sonar_image(
             self._sonar,
             image,

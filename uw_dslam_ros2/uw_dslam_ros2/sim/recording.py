@@ -34,6 +34,7 @@ from uw_dslam_ros2.sim.recorder import TRUTH_STEP, VehicleRecorder
 __all__ = ["RecordedMission", "read_mission", "simulate_mission"]
 
 _CHUNK_PINGS = 40
+_CHUNK_BEAMS = 500
 _PARTIAL = ".partial"
 
 Progress = Callable[[int, int], None]
@@ -116,7 +117,7 @@ def _record(
                 recorder = VehicleRecorder(writer, run, mission)
                 for image in images(vehicle, run.num_pings):
                     recorder.write_until(image.stamp_ns)
-                    recorder.write_image(image)
+                    recorder.write_ping(image)
                     done += 1
                     if progress is not None:
                         progress(done, total)
@@ -146,10 +147,11 @@ class _ping_source:  # noqa: N801 - used like a function
             initializer=_start_worker,
             initargs=(self._mission.config,),
         )
+        size = _CHUNK_BEAMS if self._mission.config.is_turning else _CHUNK_PINGS
         chunks = {
             vehicle: [
-                self._pool.submit(_make_chunk, vehicle, start, min(start + _CHUNK_PINGS, count))
-                for start in range(0, count, _CHUNK_PINGS)
+                self._pool.submit(_make_chunk, vehicle, start, min(start + size, count))
+                for start in range(0, count, size)
             ]
             for vehicle, count in enumerate(run.num_pings for run in self._mission.runs)
         }
@@ -182,10 +184,7 @@ def _write_truth(folder: Path, mission: Mission) -> None:
     """Everything that a recording of the real world would not have, and `mission.json`."""
     config, world = mission.config, mission.world
     spec = grid_over(world, config.truth_resolution_m)
-    seen = [
-        seen_map(world, spec, every_metre(run), config.sonar.fov_rad, config.sonar.max_range_m)
-        for run in mission.runs
-    ]
+    seen = [seen_map(world, spec, every_metre(run), *config.field_of_view) for run in mission.runs]
     values = np.stack([m.values for m in seen]).max(axis=0).astype(np.int8)
     write_map(folder / "map", OccupancyMap(spec, values))
     for run in mission.runs:
