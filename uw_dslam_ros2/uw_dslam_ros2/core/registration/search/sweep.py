@@ -149,7 +149,7 @@ class Sweep:
 
     def num_open(self, floor: float) -> int:
         """Number of boxes of the last level above ``floor``."""
-        return int(np.count_nonzero(self._sums > np.float64(floor)))
+        return int(np.count_nonzero(self._sums > _rounded_down(floor)))
 
     def highest(self, count: int) -> FloatArray:
         """Boxes (K, 6) with the highest bounds, one of a tile, highest first."""
@@ -159,10 +159,12 @@ class Sweep:
 
     def boxes(self, floor: float) -> tuple[FloatArray, FloatArray]:
         """Boxes (K, 6) above a floor and their bounds (K,), highest first."""
-        tiles, cells = np.nonzero(self._sums > np.float64(floor))
-        bounds = self._sums[tiles, cells].astype(np.float64)
+        sums = self._sums.ravel()
+        places = np.flatnonzero(sums > _rounded_down(floor))
+        bounds = sums[places]
         order = np.argsort(-bounds, kind="stable")
-        return self._boxes(tiles[order], cells[order]), bounds[order]
+        tiles, cells = np.divmod(places[order], SIDE**2)
+        return self._boxes(tiles, cells), bounds[order].astype(np.float64)
 
     def _boxes(self, tiles: IntArray, cells: IntArray) -> FloatArray:
         """Boxes of some cells, without what sticks out of the window."""
@@ -275,6 +277,11 @@ class Sweep:
             ends.append((used[0], used[-1] + 1) if len(used) else (0, 1))
         content = np.array(ends, dtype=np.float64).T.ravel()
         return level.fold, content, tables
+
+
+def _rounded_down(value: float) -> np.float32:
+    """As float32, which is quicker to compare with, and no greater."""
+    return np.nextafter(np.float32(value), np.float32(-np.inf))
 
 
 def _layers(narrowest: int, widest: float) -> IntArray:
