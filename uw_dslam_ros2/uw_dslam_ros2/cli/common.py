@@ -15,10 +15,11 @@ from typing import Protocol
 from tqdm import tqdm
 
 import uw_dslam_ros2
-from uw_dslam_ros2.core.errors import DataError, UwDslamError
+from uw_dslam_ros2.core.errors import DataError, NothingMappedError, UwDslamError
 
 __all__ = [
     "EXIT_BAD_INPUT",
+    "EXIT_NOTHING_MADE",
     "Progress",
     "config_file",
     "parser_for",
@@ -27,6 +28,8 @@ __all__ = [
     "versions",
 ]
 
+EXIT_NOTHING_MADE = 1
+"""Exit code where the input is readable, but nothing could be made of it."""
 EXIT_BAD_INPUT = 2
 """Exit code for wrong usage, files and settings; argparse uses the same."""
 _EXIT_INTERRUPTED = 130
@@ -44,12 +47,15 @@ def parser_for(name: str, description: str, example: str) -> argparse.ArgumentPa
 
 
 def run_command(name: str, command: Callable[[], int]) -> int:
-    """Run a command; what a person can mend is told in one line on stderr, with exit code 2."""
+    """Run a command; what a person can mend is told in one line on stderr.
+
+    The exit code is 2 then, or 1 where nothing could be made of good input.
+    """
     try:
         return command()
     except UwDslamError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+        return EXIT_NOTHING_MADE if isinstance(error, NothingMappedError) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return _EXIT_INTERRUPTED

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from uw_dslam_ros2.cli.common import parser_for, run_command
 from uw_dslam_ros2.cli.outcome import Trajectory, json_bytes
+from uw_dslam_ros2.cli.report import whose_error
 from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M, Scores, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.io.maps import read_map
@@ -83,12 +84,18 @@ def _trajectories(result: Path) -> tuple[dict[str, Trajectory], dict[str, Trajec
     return merged, own
 
 
+def _whose(scores: Scores) -> str:
+    assert scores.trajectory is not None
+    scored = list(scores.trajectory.per_vehicle_rmse_m)
+    return whose_error(scored, len({*scored, *scores.alone_rmse_m, *scores.without_truth}))
+
+
 def _lines(scores: Scores) -> list[str]:
     lines = []
     error = scores.trajectory
     if error is not None:
         lines += [
-            f"trajectories, {error.num_poses} poses in one frame:",
+            f"trajectories, {error.num_poses} poses {_whose(scores)}:",
             f"  RMSE {error.rmse_m:.3f} m, median {error.median_m:.3f} m, "
             f"largest {error.max_m:.3f} m, yaw RMSE {math.degrees(error.rmse_rad):.2f} degrees",
         ]

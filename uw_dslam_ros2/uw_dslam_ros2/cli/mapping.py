@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import multiprocessing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -12,18 +13,32 @@ from pathlib import Path
 from typing import Any
 
 from uw_dslam_ros2.cli.common import num_processors, num_workers
+from uw_dslam_ros2.core.clocks import find_gaps
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
+from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.core.health import MappedVehicle, SensorCount, health_findings
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.vehicle_mapper import VehicleMapper
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.io.bags import TransformEvent, TruthEvent, open_bag, read_events
-from uw_dslam_ros2.io.feeding import Mountings, feed, in_stamp_order
+from uw_dslam_ros2.io.bags import ImuEvent, TransformEvent, TruthEvent
+from uw_dslam_ros2.io.events import VehicleReader
+from uw_dslam_ros2.io.feeding import Mountings, feed, in_stamp_order, role_of
+from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
+from uw_dslam_ros2.io.topics import base_frame_of
+from uw_dslam_ros2.io.vehicles import VehicleRecording
 
-__all__ = ["OfflineConfig", "VehicleSubmaps", "map_bag", "map_bags", "settle", "vehicle_of_bag"]
+__all__ = [
+    "OfflineConfig",
+    "VehicleSubmaps",
+    "map_recording",
+    "map_recordings",
+    "sensor_config",
+    "settle",
+]
 
 # One number, whatever the machine: which registrations are asked next depends on the answers.
 _BATCH = 4
@@ -38,6 +53,7 @@ class OfflineConfig:
     mapper: dict[str, VehicleMapperConfig]
     registration: GridRegistrationConfig
     queue: MapQueueConfig
+    sensors: dict[str, SensorConfig]
 
     @classmethod
     def read(cls, path: str | Path | None, vehicles: Sequence[str]) -> OfflineConfig:
@@ -50,15 +66,22 @@ class OfflineConfig:
             },
             file.section(GridRegistrationConfig, "registration", "/registration_server"),
             file.section(MapQueueConfig, "queue", "/map_queue_manager"),
+            {name: sensor_config(file, name) for name in vehicles},
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
         return {
             "mapper": {name: config.to_dict() for name, config in self.mapper.items()},
+            "sensors": {name: config.to_dict() for name, config in self.sensors.items()},
             "registration": self.registration.to_dict(),
             "queue": self.queue.to_dict(),
         }
+
+
+def sensor_config(file: SettingsFile, vehicle_id: str) -> SensorConfig:
+    """What a settings file says of one vehicle's sensors."""
+    return file.plain(SensorConfig, f"/{vehicle_id}/sonar_mapper")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,44 +91,28 @@ class VehicleSubmaps:
     vehicle_id: str
     submaps: tuple[Submap, ...]
     diagnostics: dict[str, float | int | str]
+    findings: tuple[Finding, ...] = ()
 
 
-def vehicle_of_bag(path: Path) -> str:
-    """Name of the one vehicle of a bag, by the namespace of its topics.
-
-    Raises
-    ------
-    DataError
-        If there is none, or more than one.
-    """
-    with open_bag(path) as reader:
-        names = {topic.strip("/").split("/")[0] for topic in reader.topics if topic.count("/") > 1}
-    if len(names) != 1:
-        raise DataError(
-            f"{path}: its topics have the namespaces {', '.join(sorted(names)) or '(none)'}; "
-            "expected those of one vehicle, as in /auv_1/sonar"
-        )
-    return names.pop()
-
-
-def map_bags(
-    bags: Sequence[Path], config: OfflineConfig, progress: Counter | None = None
+def map_recordings(
+    recordings: Sequence[VehicleRecording],
+    config: OfflineConfig,
+    progress: Counter | None = None,
 ) -> list[VehicleSubmaps]:
     """Map every vehicle by itself, several at a time; the result does not depend on how many."""
     context = multiprocessing.get_context("spawn")
     done = context.Value("q", 0)
-    total = 0
-    for bag in bags:
-        with open_bag(bag) as reader:
-            total += sum(reader.message_counts.values())
-    num_processes = num_workers(len(bags))
+    total = sum(recording.num_messages for recording in recordings)
+    num_processes = num_workers(len(recordings))
     with ProcessPoolExecutor(
         num_processes, mp_context=context, initializer=_share, initargs=(done,)
     ) as pool:
         futures = []
-        for bag in bags:
-            vehicle_id = vehicle_of_bag(bag)
-            futures.append(pool.submit(map_bag, bag, vehicle_id, config.mapper[vehicle_id]))
+        for recording in recordings:
+            name = recording.vehicle_id
+            futures.append(
+                pool.submit(map_recording, recording, config.mapper[name], config.sensors[name])
+            )
         try:
             while wait(futures, timeout=0.2).not_done:
                 if progress is not None:
@@ -141,30 +148,89 @@ def _count(number: int) -> None:
             done.value += number
 
 
-def map_bag(bag: Path, vehicle_id: str, config: VehicleMapperConfig) -> VehicleSubmaps:
-    """Map one vehicle's bag; `DataError` where it cannot be read."""
-    mapper = VehicleMapper(config, vehicle_id)
-    mountings = Mountings(f"{vehicle_id}/base_link")
+def map_recording(
+    recording: VehicleRecording,
+    config: VehicleMapperConfig,
+    sensors: SensorConfig = SensorConfig(),  # noqa: B008 (frozen)
+) -> VehicleSubmaps:
+    """Map one vehicle; `DataError` where its bags cannot be read or a mounting is not known."""
+    mapper = VehicleMapper(config, recording.vehicle_id)
     newest: dict[int, Submap] = {}
     number = 0
-    for number, event in enumerate(in_stamp_order(read_events(bag)), start=1):
-        if number % 200 == 0:
-            _count(200)
-        if isinstance(event, TransformEvent):
-            mountings.add(event)
-            continue
-        if isinstance(event, TruthEvent):
-            continue
-        try:
-            submaps = feed(mapper, event, mountings.of(event))
-        except InvalidInputError as error:
-            raise DataError(f"{bag}: {type(event).__name__}: {error}") from error
-        newest |= {submap.sequence: submap for submap in submaps}
-    newest |= {submap.sequence: submap for submap in mapper.finish()}
+    has_yaw = has_yaw_rate = False
+    with VehicleReader(recording, sensors) as reader:
+        findings = reader.check_clocks()
+        mountings = _mountings(recording, sensors, reader.transforms())
+        for number, event in enumerate(in_stamp_order(reader.events()), start=1):
+            if number % 200 == 0:
+                _count(200)
+            if isinstance(event, TruthEvent | TransformEvent):
+                continue
+            if isinstance(event, ImuEvent):
+                has_yaw |= event.yaw_rad is not None
+                has_yaw_rate |= event.yaw_rate_rad_s is not None
+            try:
+                submaps = feed(mapper, event, mountings.of(event))
+            except InvalidInputError as error:
+                raise DataError(f"{recording.vehicle_id}: {role_of(event)}: {error}") from error
+            newest |= {submap.sequence: submap for submap in submaps}
+        newest |= {submap.sequence: submap for submap in mapper.finish()}
     _count(number % 200)
-    return VehicleSubmaps(
-        vehicle_id, tuple(newest[key] for key in sorted(newest)), mapper.diagnostics()
+    stamps_ns, poses = mapper.trajectory()
+    sensor_stamps = {role: stamps for role, stamps in reader.stamps.items() if len(stamps)}
+    vehicle = MappedVehicle(
+        recording.vehicle_id,
+        {
+            role: SensorCount(
+                count.num - count.num_repeated, count.num_bad, count.num_empty, count.problem
+            )
+            for role, count in reader.counts.items()
+            if count.num and role != "truth"
+        },
+        mapper.diagnostics(),
+        find_gaps(sensor_stamps),
+        {role: (int(s.min()), int(s.max())) for role, s in sensor_stamps.items()},
+        stamps_ns,
+        poses,
+        has_yaw=has_yaw,
+        has_yaw_rate=has_yaw_rate,
     )
+    findings = [
+        dataclasses.replace(finding, vehicle_id=recording.vehicle_id) for finding in findings
+    ]
+    return VehicleSubmaps(
+        recording.vehicle_id,
+        tuple(newest[key] for key in sorted(newest)),
+        mapper.diagnostics(),
+        (*findings, *_unmounted(mountings, recording.vehicle_id), *health_findings(vehicle)),
+    )
+
+
+def _mountings(
+    recording: VehicleRecording, sensors: SensorConfig, transforms: Iterable[TransformEvent]
+) -> Mountings:
+    """Where a vehicle's instruments sit."""
+    known = list(transforms)
+    names = {name.strip("/") for t in known for name in (t.frame_id, t.child_frame_id)}
+    mountings = Mountings(
+        sensors.base_frame or base_frame_of(names, recording.vehicle_id, recording.namespace)
+    )
+    for transform in known:
+        mountings.add(transform)
+    return mountings
+
+
+def _unmounted(mountings: Mountings, vehicle_id: str) -> list[Finding]:
+    return [
+        Finding(
+            "no_mounting",
+            "velocity" if word == "dvl" else word,
+            f"no transform says where its frame {frame_id!r} is on the vehicle; it is taken to sit "
+            "at the origin, level and looking ahead",
+            vehicle_id=vehicle_id,
+        )
+        for frame_id, word in sorted(mountings.unknown.items())
+    ]
 
 
 def settle(

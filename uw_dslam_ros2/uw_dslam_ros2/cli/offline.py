@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from uw_dslam_ros2.cli.common import parser_for, progress_bar, run_command, versions
-from uw_dslam_ros2.cli.mapping import OfflineConfig, map_bags, settle, vehicle_of_bag
+from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recordings, sensor_config, settle
 from uw_dslam_ros2.cli.outcome import outcome_of
 from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
 from uw_dslam_ros2.cli.scoring import Truth, read_truth
-from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.errors import ConfigError, DataError, NothingMappedError
 from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
+from uw_dslam_ros2.io.settings import SettingsFile
+from uw_dslam_ros2.io.vehicles import find_recordings
 
 __all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Map bags and merge them; exit code 0 also where some vehicles could not be merged."""
+    """Map bags and merge them; exit code 0 also where some vehicles could not be merged.
+
+    1 where nothing could be mapped, 2 for bad input.
+    """
     args = _parser().parse_args(argv)
     return run_command("offline", lambda: _run(args))
 
@@ -32,7 +39,13 @@ def _parser() -> argparse.ArgumentParser:
         "Uses no ROS and no clock: the same bags and settings give the same files.",
         "offline mission/auv_1 mission/auv_2 mission/auv_3 --out result",
     )
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="one for each vehicle")
+    parser.add_argument(
+        "bags",
+        nargs="*",
+        type=Path,
+        metavar="BAG",
+        help="recordings: one for each vehicle, one of all, or several of one",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="settings (YAML, as for the nodes)"
@@ -44,6 +57,21 @@ def _parser() -> argparse.ArgumentParser:
         help="true trajectories (<vehicle>.tum) and map (map.yaml), only for scoring "
         "(default: the folder 'truth' beside the first bag, where there is one)",
     )
+    parser.add_argument(
+        "--topic",
+        action="append",
+        default=[],
+        metavar="ROLE=TOPIC",
+        help="which topic is the sonar, velocity, imu, depth, odometry or fix, where it is not "
+        "found by its type; without a first slash it is below each vehicle's namespace",
+    )
+    parser.add_argument(
+        "--vehicle",
+        action="append",
+        default=[],
+        metavar="NAME=BAG[,BAG...]",
+        help="bags of one vehicle, and its name, where topics do not tell",
+    )
     parser.add_argument("--title", default="", help="name of the run in the report")
     parser.add_argument("--no-report", action="store_true", help="no pictures, no HTML")
     return parser
@@ -51,17 +79,31 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(args: argparse.Namespace) -> int:
     started_s = time.monotonic()
-    vehicles = [vehicle_of_bag(bag) for bag in args.bags]
-    for vehicle in vehicles:
-        if vehicles.count(vehicle) > 1:
-            raise DataError(f"two bags are of {vehicle}; expected one for each vehicle")
+    file = SettingsFile(args.config)
+    topics = TopicsConfig.of_options(args.topic)
+
+    def settings_of(vehicle_id: str) -> SensorConfig:
+        own = sensor_config(file, vehicle_id)
+        return dataclasses.replace(own, topics=topics.over(own.topics))
+
+    named = _named_bags(args.vehicle)
+    bags = [*args.bags, *(bag for own in named.values() for bag in own)]
+    if not bags:
+        raise DataError("no bags are named; expected at least one")
+    recordings, findings = find_recordings(args.bags, settings_of, named)
+    vehicles = [recording.vehicle_id for recording in recordings]
     config = OfflineConfig.read(args.config, vehicles)
-    truth = _truth(args)
+    config = dataclasses.replace(config, sensors={v: settings_of(v) for v in vehicles})
+    truth = _truth(args, bags[0])
 
     say(f"mapping {len(vehicles)} vehicles")
     with progress_bar("mapping", " messages") as progress:
-        mapped = map_bags(args.bags, config, progress)
+        mapped = map_recordings(recordings, config, progress)
     mapped_s = time.monotonic()
+    findings += [finding for made in mapped for finding in made.findings]
+    unmapped = [made.vehicle_id for made in mapped if not made.submaps]
+    if len(unmapped) == len(mapped):
+        raise NothingMappedError("; ".join(f.sentence for f in findings))
 
     queue = MapQueue(config.queue)
     for made in mapped:
@@ -74,14 +116,18 @@ def _run(args: argparse.Namespace) -> int:
 
     facts = RunFacts(
         title=args.title or "offline: " + ", ".join(vehicles),
-        source=[bag.name for bag in args.bags],
+        source=[bag.name for bag in bags],
         command="offline",
         settings=config.to_dict(),
         seeds={},
         versions=versions(),
         diagnostics={made.vehicle_id: made.diagnostics for made in mapped},
+        notes=[finding.sentence for finding in findings if finding.severity != "info"],
+        findings=[finding.to_dict() for finding in findings],
     )
-    outcome = outcome_of(queue)
+    for note in facts.notes:
+        print(f"warning: {note}", file=sys.stderr, flush=True)
+    outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
     scores = write_report(args.out, outcome, facts, truth, has_pictures=not args.no_report)
     done_s = time.monotonic()
     say(
@@ -93,10 +139,20 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _truth(args: argparse.Namespace) -> Truth | None:
+def _named_bags(options: Sequence[str]) -> dict[str, list[Path]]:
+    named: dict[str, list[Path]] = {}
+    for text in options:
+        name, is_set, bags = text.partition("=")
+        if not is_set or not all(bags.split(",")):
+            raise ConfigError(f"vehicle {text!r}: expected NAME=BAG, or NAME=BAG,BAG")
+        named.setdefault(name, []).extend(Path(bag) for bag in bags.split(","))
+    return named
+
+
+def _truth(args: argparse.Namespace, first_bag: Path) -> Truth | None:
     if args.truth is not None:
         return read_truth(args.truth)
-    beside = args.bags[0].resolve().parent / "truth"
+    beside = first_bag.resolve().parent / "truth"
     return read_truth(beside) if beside.is_dir() else None
 
 

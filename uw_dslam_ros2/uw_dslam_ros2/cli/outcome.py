@@ -40,11 +40,17 @@ Trajectory = tuple[NDArray[np.int64], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class RegistrationRow:
-    """One registration as it is listed; lengths in metres, angles in radians, NaN: not known."""
+    """One registration as it is listed; lengths in metres, angles in radians, NaN: not known.
+
+    ``x``, ``y``, ``yaw`` are T_target_source: they take what lies in the frame of submap
+    ``source_frame`` to that of submap ``target_frame``; the sigmas are in the target's frame.
+    """
 
     number: int
     source: str
     target: str
+    source_frame: str
+    target_frame: str
     verdict: str
     reason: str
     is_used: bool
@@ -80,6 +86,8 @@ class RegistrationRow:
             number,
             names_of(answer.query.source.ids),
             names_of(answer.query.target.ids),
+            names_of([answer.query.source.reference]),
+            names_of([answer.query.target.reference]),
             answer.verdict.name,
             answer.why,
             is_used,
@@ -138,6 +146,13 @@ class Outcome:
     registrations: tuple[RegistrationRow, ...]
     provenance: MapProvenance | None = None
     loops: tuple[LoopError, ...] = ()
+    unmapped: tuple[str, ...] = ()
+    """Vehicles of which there is no map at all."""
+
+    @property
+    def num_vehicles(self) -> int:
+        """All, those without a map included."""
+        return len(self.vehicles) + len(self.unmapped)
 
     @property
     def num_merged_vehicles(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.provenance import contradictions_png
 
-__all__ = ["RunFacts", "headline", "write_report"]
+__all__ = ["RunFacts", "headline", "whose_error", "write_report"]
 
 _MEANING = {
     Verdict.ACCEPTED: "the transform may be used",
@@ -44,6 +44,7 @@ class RunFacts:
     diagnostics: Mapping[str, Mapping[str, float | int | str]] = field(default_factory=dict)
     times_s: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    findings: list[dict[str, Any]] = field(default_factory=list)
 
 
 def write_report(
@@ -80,7 +81,7 @@ def report_dict(outcome: Outcome, facts: RunFacts, scores: Scores) -> dict[str, 
         "title": facts.title,
         "command": facts.command,
         "source": facts.source,
-        "num_vehicles": len(outcome.vehicles),
+        "num_vehicles": outcome.num_vehicles,
         "num_vehicles_merged": outcome.num_merged_vehicles,
         "vehicles": [
             {
@@ -93,10 +94,12 @@ def report_dict(outcome: Outcome, facts: RunFacts, scores: Scores) -> dict[str, 
             }
             for v in outcome.vehicles
         ],
+        "vehicles_not_mapped": list(outcome.unmapped),
         "num_registrations": len(outcome.registrations),
         "verdicts": outcome.verdict_counts(),
         "scores": scores.to_dict(),
         "notes": facts.notes,
+        "findings": facts.findings,
         "seeds": facts.seeds,
         "versions": facts.versions,
         "settings": facts.settings,
@@ -109,15 +112,18 @@ def report_dict(outcome: Outcome, facts: RunFacts, scores: Scores) -> dict[str, 
 
 def headline(outcome: Outcome, scores: Scores) -> str:
     """How good it is, in one sentence or two."""
-    num, merged = len(outcome.vehicles), outcome.num_merged_vehicles
+    num, merged = outcome.num_vehicles, outcome.num_merged_vehicles
     left = [v.vehicle_id for v in outcome.vehicles if not v.is_merged]
     text = f"{merged} of {num} vehicles merged"
     if left:
         text += f" (NOT merged: {', '.join(left)})"
+    if outcome.unmapped:
+        text += f" (NOT mapped: {', '.join(outcome.unmapped)})"
     if scores.trajectory is not None:
         text += (
             f"; trajectory error {scores.trajectory.rmse_m:.2f} m RMSE, "
-            f"{math.degrees(scores.trajectory.rmse_rad):.1f} degrees, in one frame"
+            f"{math.degrees(scores.trajectory.rmse_rad):.1f} degrees, "
+            + whose_error(list(scores.trajectory.per_vehicle_rmse_m), num)
         )
     if scores.map is not None:
         text += (
@@ -127,6 +133,13 @@ def headline(outcome: Outcome, scores: Scores) -> str:
     if scores.trajectory is None:
         text += "; no truth to compare with"
     return text
+
+
+def whose_error(scored: Sequence[str], num_vehicles: int) -> str:
+    """Say whose an error is: it is not that of vehicles which are in no common frame."""
+    if len(scored) == num_vehicles:
+        return "in one frame" if num_vehicles > 1 else f"of {scored[0]}"
+    return f"of {', '.join(scored)} alone ({len(scored)} of {num_vehicles} vehicles)"
 
 
 def _draw(outcome: Outcome, truth: Truth | None, scores: Scores) -> dict[str, bytes]:
@@ -160,6 +173,9 @@ def render_html(
         facts=facts,
         scores=scores,
         headline=headline(outcome, scores),
+        whose=""
+        if scores.trajectory is None
+        else whose_error(list(scores.trajectory.per_vehicle_rmse_m), outcome.num_vehicles),
         colors=colors,
         images={
             name: "data:image/png;base64," + base64.b64encode(content).decode()

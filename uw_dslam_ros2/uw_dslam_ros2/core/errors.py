@@ -1,6 +1,6 @@
 """The project's exceptions, with one root."""
 
-__all__ = ["ConfigError", "DataError", "InvalidInputError", "UwDslamError"]
+__all__ = ["ConfigError", "DataError", "InvalidInputError", "NothingMappedError", "UwDslamError"]
 
 
 class UwDslamError(Exception):
@@ -17,3 +17,7 @@ class InvalidInputError(UwDslamError, ValueError):
 
 class DataError(UwDslamError, OSError):
     """A file or recording is missing, truncated, or not what it should be."""
+
+
+class NothingMappedError(DataError):
+    """Recordings could be read, but no honest map can be made of them."""

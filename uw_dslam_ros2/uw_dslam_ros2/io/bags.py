@@ -1,7 +1,6 @@
 """Bags under one name: `recordings` reads and writes files, `events` gives them a meaning."""
 
 from uw_dslam_ros2.io.events import (
-    TOPIC_TYPES,
     DepthEvent,
     Event,
     ImageEvent,
@@ -24,7 +23,6 @@ from uw_dslam_ros2.io.recordings import (
 )
 
 __all__ = [
-    "TOPIC_TYPES",
     "BagReader",
     "BagWriter",
     "DepthEvent",

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
+import numpy as np
+
+from uw_dslam_ros2.core.clocks import StreamTimes, corrected_clocks
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
+from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io import messages
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
@@ -14,43 +22,37 @@ from uw_dslam_ros2.io.readings import (
     ImageEvent,
     ImuEvent,
     PointsEvent,
+    Reading,
     ScanEvent,
     TransformEvent,
     TruthEvent,
     VelocityEvent,
 )
-from uw_dslam_ros2.io.recordings import BagReader, merged, open_bags
+from uw_dslam_ros2.io.recordings import BagReader, RawMessage, merged, open_bag
+from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
+from uw_dslam_ros2.io.topics import roles_of_type
+from uw_dslam_ros2.io.vehicles import VehicleRecording, find_recordings
 
 __all__ = [
-    "TOPIC_TYPES",
     "DepthEvent",
     "Event",
     "ImageEvent",
     "ImuEvent",
+    "MessageCount",
     "PointsEvent",
     "ScanEvent",
     "TransformEvent",
     "TruthEvent",
+    "VehicleReader",
     "VelocityEvent",
     "read_events",
+    "readings_of",
 ]
 
-_VELOCITY_TYPES = (
-    "marine_acoustic_msgs/msg/Dvl",
-    "geometry_msgs/msg/TwistWithCovarianceStamped",
-)
-TOPIC_TYPES: dict[str, tuple[str, ...]] = {
-    "sonar": ("marine_acoustic_msgs/msg/ProjectedSonarImage",),
-    "imu": ("sensor_msgs/msg/Imu",),
-    "dvl": _VELOCITY_TYPES,
-    "velocity": _VELOCITY_TYPES,
-    "depth": ("sensor_msgs/msg/FluidPressure",),
-    "scan": ("sensor_msgs/msg/LaserScan",),
-    "points": ("sensor_msgs/msg/PointCloud2",),
-    "tf_static": ("tf2_msgs/msg/TFMessage",),
-    "truth/odom": ("nav_msgs/msg/Odometry",),
-}
-"""Topics that are understood, by the name below the vehicle's namespace, and their types."""
+_SECOND_NS = 1_000_000_000
+_MAX_MOUNTINGS = 200
+"""Messages of /tf that are read for mountings: it goes on at a high rate, and repeats them."""
+_TRUTH = "truth"
 
 
 def read_events(
@@ -58,17 +60,17 @@ def read_events(
     vehicle_id: str | None = None,
     data_order: str = "range_major",
     *,
-    topics: Mapping[str, str] | None = None,
+    topics: TopicsConfig | None = None,
     water_density_kg_m3: float = 1025.0,
 ) -> Iterator[Event]:
-    """Events of one or several bags in order of recording, fixed transforms first.
+    """Events of one or several bags, fixed transforms first, vehicle after vehicle.
 
     Parameters
     ----------
-    paths : bags, as `open_bag` takes them; with several, their messages are merged by time.
+    paths : bags, as `open_bag` takes them.
     vehicle_id : whose they are; None takes it from the topics' namespace (``/auv_1/sonar``).
     data_order : layout of sonar images, one of `messages.DATA_ORDERS`.
-    topics : for bags with other names: a name of `TOPIC_TYPES` to the full topic in the bag.
+    topics : topics that are set; the others are found by their types.
     water_density_kg_m3 : turns pressure into depth; fresh water has 1000.
 
     Yields
@@ -80,133 +82,237 @@ def read_events(
     Raises
     ------
     DataError
-        If a bag is unusable, a topic has the wrong type, no topic is known, or a message is
-        malformed.
+        If a bag is unusable, no topic can be read, or a message is malformed.
     """
-    if data_order not in messages.DATA_ORDERS:
-        raise DataError(f"data_order is {data_order!r}, expected one of {messages.DATA_ORDERS}")
+    settings = SensorConfig(
+        data_order=data_order,
+        water_density_kg_m3=water_density_kg_m3,
+        topics=topics or TopicsConfig(),
+    )
     paths = [paths] if isinstance(paths, str | Path) else list(paths)
-    context = _Context(vehicle_id, data_order, water_density_kg_m3)
-    with open_bags(paths) as readers:
-        roles = [_roles(reader, dict(topics or {})) for reader in readers]
-        for is_static in (True, False):
-            chosen = [
-                [topic for topic, role in table.items() if (role == "tf_static") is is_static]
-                for table in roles
-            ]
-            for index, raw in merged(readers, chosen):
-                content = readers[index].deserialize(raw)
-                try:
-                    yield from context.convert(roles[index][raw.topic], raw.topic, content)
-                except InvalidInputError as error:
-                    raise DataError(
-                        f"{readers[index].path}: bad message on {raw.topic} "
-                        f"at {raw.stamp_ns} ns: {error}"
-                    ) from error
+    if not paths:
+        raise DataError("no bags given; expected at least one path")
+    named = {} if vehicle_id is None else {vehicle_id: paths}
+    recordings, _ = find_recordings([] if named else paths, lambda _: settings, named)
+    with ExitStack() as stack:
+        readers = [
+            stack.enter_context(VehicleReader(recording, settings, is_strict=True))
+            for recording in recordings
+        ]
+        for reader in readers:
+            yield from reader.transforms()
+        for reader in readers:
+            yield from reader.events()
 
 
-def _roles(reader: BagReader, renamed: dict[str, str]) -> dict[str, str]:
-    """Topic -> name in `TOPIC_TYPES`, of those topics of a bag that have one."""
-    if unknown := sorted(set(renamed) - set(TOPIC_TYPES)):
-        raise DataError(
-            f"unknown topic role {unknown[0]!r}, expected one of {', '.join(TOPIC_TYPES)}"
-        )
-    by_topic = {topic: role for role, topic in renamed.items()}
-    roles = {}
-    for topic, msgtype in reader.topics.items():
-        parts = topic.strip("/").split("/")
-        names = ("/".join(parts[-2:]), parts[-1])
-        role = by_topic.get(topic) or next((n for n in names if n in TOPIC_TYPES), None)
-        if role is None or (role in renamed and topic not in by_topic):
-            continue
-        if msgtype not in TOPIC_TYPES[role]:
-            raise DataError(
-                f"{reader.path}: topic {topic} has type {msgtype}, "
-                f"expected {' or '.join(TOPIC_TYPES[role])}"
-            )
-        roles[topic] = role
-    if not roles:
-        raise DataError(
-            f"{reader.path}: none of its topics is known ({', '.join(sorted(reader.topics))}); "
-            f"expected names that end in {', '.join(TOPIC_TYPES)}"
-        )
-    return roles
+@dataclass(slots=True)
+class MessageCount:
+    """What became of a sensor's messages; `problem` is that of the first bad one."""
+
+    num: int = 0
+    num_bad: int = 0
+    num_empty: int = 0
+    num_repeated: int = 0
+    problem: str = ""
 
 
-class _Context:
-    """Turns messages into events."""
+class VehicleReader:
+    """One vehicle's messages as events; a context manager.
+
+    Stamps are on one clock, as `corrected_clocks` leaves them, unless `is_strict`: then stamps are
+    as they are, and the first bad message raises.
+
+    Parameters
+    ----------
+    recording : whose, from which bags and topics.
+    settings : what messages do not say of themselves.
+    is_strict : raise `DataError` for a bad message; else count it and go on.
+    """
 
     def __init__(
-        self, vehicle_id: str | None, data_order: str, water_density_kg_m3: float
+        self,
+        recording: VehicleRecording,
+        settings: SensorConfig = SensorConfig(),  # noqa: B008 (frozen)
+        *,
+        is_strict: bool = False,
     ) -> None:
-        self._vehicle_id = vehicle_id
-        self._data_order = data_order
-        self._water_density_kg_m3 = water_density_kg_m3
+        self._recording = recording
+        self._settings = settings
+        self._is_strict = is_strict
+        self._roles = {topic: role for role, topic in recording.topics.items()}
+        self._readers: list[BagReader] = []
+        self._stack = ExitStack()
+        self.counts: dict[str, MessageCount] = {role: MessageCount() for role in recording.topics}
+        self.stamps: dict[str, np.ndarray[Any, np.dtype[np.int64]]] = {}
 
-    def convert(self, role: str, topic: str, msg: Any) -> Iterator[Event]:
-        if role == "tf_static":
-            yield from self._transforms(msg)
-            return
-        who = self._vehicle_id or _vehicle_of(topic, role)
-        key = (who, messages.stamp_of(msg), str(msg.header.frame_id))
-        event = self._CONVERTERS[role](self, key, msg)
-        if event is not None:
-            yield event
+    def __enter__(self) -> Self:
+        for bag in self._recording.bags:
+            self._readers.append(self._stack.enter_context(open_bag(bag)))
+        return self
 
-    def _transforms(self, msg: Any) -> Iterator[Event]:
-        for item in msg.transforms:
-            child = str(item.child_frame_id)
-            yield TransformEvent(
-                self._vehicle_id or child.strip("/").split("/")[0],
-                int(item.header.stamp.sec) * 1_000_000_000 + int(item.header.stamp.nanosec),
-                str(item.header.frame_id),
-                child,
-                messages.matrix_of_transform(item.transform),
-            )
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
 
-    def _image(self, key: _Key, msg: Any) -> Event:
-        return ImageEvent(*key, messages.sonar_image_of(msg, self._data_order))
+    def check_clocks(self) -> list[Finding]:
+        """Read the stamps of all messages, to put them on one clock in `events`."""
+        stamps: dict[str, list[int]] = {role: [] for role in self._recording.topics}
+        recorded: dict[str, list[int]] = {role: [] for role in self._recording.topics}
+        for index, raw in merged(self._readers, self._sensor_topics()):
+            role = self._roles[raw.topic]
+            stamps[role].append(_stamp_of(self._readers[index], raw))
+            recorded[role].append(raw.stamp_ns)
+        times = {
+            role: StreamTimes(np.array(stamps[role], np.int64), np.array(recorded[role], np.int64))
+            for role in stamps
+            if role != _TRUTH
+        }
+        self.stamps, findings = corrected_clocks(times)
+        return findings
 
-    def _imu(self, key: _Key, msg: Any) -> Event:
-        return ImuEvent(*key, *messages.readings_of_imu(msg))
+    def transforms(self) -> Iterator[TransformEvent]:
+        """Fixed transforms of all bags: those that are latched, then what /tf has beside them."""
+        for is_latched in (True, False):
+            for reader in self._readers:
+                topics = [
+                    topic
+                    for topic, msgtype in reader.topics.items()
+                    if roles_of_type(msgtype) == ("tf_static",)
+                    and topic.endswith("tf_static") is is_latched
+                ]
+                for number, raw in enumerate(reader.raw(topics) if topics else ()):
+                    if number >= _MAX_MOUNTINGS and not is_latched:
+                        break
+                    yield from _transforms_of(reader.deserialize(raw), self._recording.vehicle_id)
 
-    def _velocity(self, key: _Key, msg: Any) -> Event | None:
-        is_dvl = hasattr(msg, "velocity_mode")
-        value = messages.velocity_of_dvl(msg) if is_dvl else messages.velocity_of_twist(msg)
-        return None if value is None else VelocityEvent(*key, *value, is_z_down=is_dvl)
+    def events(self) -> Iterator[Event]:
+        """Everything but transforms, in order of recording."""
+        number = dict.fromkeys(self._recording.topics, 0)
+        last: dict[str, bytes] = {}
+        for index, raw in merged(self._readers, self._sensor_topics()):
+            role = self._roles[raw.topic]
+            count = self.counts[role]
+            count.num += 1
+            position = number[role]
+            number[role] += 1
+            if last.get(role) == raw.data and _stamp_of(self._readers[index], raw) > 0:
+                count.num_repeated += 1  # a message that was recorded twice says nothing new
+                continue
+            last[role] = raw.data
+            stamp_ns = int(self.stamps[role][position]) if role in self.stamps else None
+            try:
+                found = self._read(self._readers[index], raw, role, stamp_ns)
+            except (InvalidInputError, DataError, ValueError, TypeError, OverflowError) as error:
+                text = f"bad message on {raw.topic} at {raw.stamp_ns} ns: {error}"
+                if self._is_strict:
+                    raise DataError(f"{self._readers[index].path}: {text}") from error
+                count.num_bad += 1
+                count.problem = count.problem or text
+                continue
+            count.num_empty += not found
+            yield from found
 
-    def _depth(self, key: _Key, msg: Any) -> Event:
-        return DepthEvent(*key, messages.depth_of_pressure(msg, self._water_density_kg_m3))
+    def _read(
+        self, reader: BagReader, raw: RawMessage, role: str, stamp_ns: int | None
+    ) -> Sequence[Event]:
+        msg = reader.deserialize(raw)
+        if stamp_ns is not None:
+            if stamp_ns <= 0:
+                raise InvalidInputError("header.stamp is 0, expected the time of the measurement")
+            if hasattr(msg, "header"):
+                stamp = msg.header.stamp
+                stamp.sec, stamp.nanosec = divmod(stamp_ns, _SECOND_NS)
+        return readings_of(role, raw.msgtype, msg, self._recording.vehicle_id, self._settings)
 
-    def _scan(self, key: _Key, msg: Any) -> Event:
-        return ScanEvent(*key, *messages.scan_of_laser_scan(msg))
+    def _sensor_topics(self) -> list[list[str]]:
+        return [[t for t in self._roles if t in reader.topics] for reader in self._readers]
 
-    def _points(self, key: _Key, msg: Any) -> Event:
-        return PointsEvent(*key, messages.points_of_cloud(msg))
 
-    def _truth(self, key: _Key, msg: Any) -> Event:
-        return TruthEvent(*key, messages.pose_of_odometry(msg))
+def _stamp_of(reader: BagReader, raw: RawMessage) -> int:
+    """Time of a message's header without reading the rest; the time of recording without one."""
+    if not reader.has_header(raw.msgtype) or len(raw.data) < 12:
+        return raw.stamp_ns
+    order = "<" if raw.data[1] & 1 else ">"
+    seconds, nanoseconds = struct.unpack_from(f"{order}iI", raw.data, 4)
+    return int(seconds) * _SECOND_NS + int(nanoseconds)
 
-    _CONVERTERS: Mapping[str, Callable[[_Context, _Key, Any], Event | None]] = {
-        "sonar": _image,
-        "imu": _imu,
-        "dvl": _velocity,
-        "velocity": _velocity,
-        "depth": _depth,
-        "scan": _scan,
-        "points": _points,
-        "truth/odom": _truth,
-    }
+
+def _transforms_of(msg: Any, vehicle_id: str) -> Iterator[TransformEvent]:
+    for item in msg.transforms:
+        yield TransformEvent(
+            vehicle_id,
+            int(item.header.stamp.sec) * _SECOND_NS + int(item.header.stamp.nanosec),
+            str(item.header.frame_id),
+            str(item.child_frame_id),
+            messages.matrix_of_transform(item.transform),
+        )
+
+
+# --- messages to readings
+# -----------------------------------------------------------------------------------------------
+
+
+def readings_of(
+    role: str, msgtype: str, msg: Any, vehicle_id: str, settings: SensorConfig
+) -> Sequence[Event]:
+    """What a message says in its role; nothing where it says that it holds nothing.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the field that is malformed.
+    """
+    key = (vehicle_id, messages.stamp_of(msg), str(msg.header.frame_id))
+    if role == _TRUTH:
+        return [TruthEvent(*key, messages.pose_of_odometry(msg))]
+    reading = _CONVERTERS[msgtype](key, msg, settings)
+    return [] if reading is None else [reading]
 
 
 _Key = tuple[str, int, str]
 """Vehicle, stamp [ns], frame: how every event begins."""
 
 
-def _vehicle_of(topic: str, role: str) -> str:
-    namespace = topic.strip("/").removesuffix(role).strip("/")
-    if not namespace:
-        raise InvalidInputError(
-            f"topic {topic} has no namespace that names its vehicle; say whose it is (vehicle_id)"
-        )
-    return namespace.split("/")[0]
+def _image(key: _Key, msg: Any, settings: SensorConfig) -> Reading:
+    return ImageEvent(*key, messages.sonar_image_of(msg, settings.data_order))
+
+
+def _imu(key: _Key, msg: Any, _: SensorConfig) -> Reading:
+    return ImuEvent(*key, *messages.readings_of_imu(msg))
+
+
+def _dvl(key: _Key, msg: Any, _: SensorConfig) -> Reading | None:
+    value = messages.velocity_of_dvl(msg)
+    return None if value is None else VelocityEvent(*key, *value, is_z_down=True)
+
+
+def _twist(key: _Key, msg: Any, _: SensorConfig) -> Reading | None:
+    value = messages.velocity_of_twist(msg)
+    return None if value is None else VelocityEvent(*key, *value)
+
+
+def _depth(key: _Key, msg: Any, settings: SensorConfig) -> Reading:
+    return DepthEvent(*key, messages.depth_of_pressure(msg, settings.water_density_kg_m3))
+
+
+def _scan(key: _Key, msg: Any, _: SensorConfig) -> Reading:
+    return ScanEvent(*key, *messages.scan_of_laser_scan(msg))
+
+
+def _points(key: _Key, msg: Any, _: SensorConfig) -> Reading:
+    return PointsEvent(*key, messages.points_of_cloud(msg))
+
+
+_CONVERTERS: dict[str, Callable[[_Key, Any, SensorConfig], Reading | None]] = {
+    "marine_acoustic_msgs/msg/ProjectedSonarImage": _image,
+    "sensor_msgs/msg/Imu": _imu,
+    "marine_acoustic_msgs/msg/Dvl": _dvl,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
+    "sensor_msgs/msg/FluidPressure": _depth,
+    "sensor_msgs/msg/LaserScan": _scan,
+    "sensor_msgs/msg/PointCloud2": _points,
+}

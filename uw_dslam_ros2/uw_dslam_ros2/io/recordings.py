@@ -139,15 +139,23 @@ class BagReader:
 
     def deserialize(self, raw: RawMessage) -> Any:
         """Content of a message of this bag, after the definitions that the bag itself carries."""
-        if raw.msgtype not in self._typestores:
-            self._typestores[raw.msgtype] = self._typestore_of(raw.msgtype)
         try:
-            return self._typestores[raw.msgtype].deserialize_cdr(raw.data, raw.msgtype)
+            return self._store(raw.msgtype).deserialize_cdr(raw.data, raw.msgtype)
         except (SerdeError, TypesysError, KeyError, *BROKEN) as error:
             raise DataError(
                 f"{self.path}: a message on {raw.topic} at {raw.stamp_ns} ns does not fit "
                 f"its type {raw.msgtype}: {error or type(error).__name__}"
             ) from error
+
+    def has_header(self, msgtype: str) -> bool:
+        """Whether a type begins with a ``std_msgs/Header``, and so with a stamp."""
+        fields = self._store(msgtype).fielddefs[msgtype][1]
+        return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
+
+    def _store(self, msgtype: str) -> Typestore:
+        if msgtype not in self._typestores:
+            self._typestores[msgtype] = self._typestore_of(msgtype)
+        return self._typestores[msgtype]
 
     def _typestore_of(self, msgtype: str) -> Typestore:
         """Types that one topic's messages need; those of other topics may be unknown."""

@@ -24,10 +24,11 @@ import yaml
 
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError
+from uw_dslam_ros2.io.sensor_settings import SensorConfig
 
 __all__ = ["NODES", "REMOVED", "SECTIONS", "SettingsFile"]
 
-SECTIONS = ("mapper", "registration", "points", "queue")
+SECTIONS = ("mapper", "registration", "points", "queue", "topics")
 """Groups of settings that are part of the core; everything else concerns a node alone."""
 
 REMOVED = {
@@ -69,6 +70,7 @@ REMOVED = {
 """Settings of earlier versions, and what became of them."""
 
 NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
+_SENSOR_SETTINGS = {field.name for field in fields(SensorConfig)}
 _EVERY_NODE = "/**"
 _PARAMETERS = "ros__parameters"
 
@@ -118,6 +120,28 @@ class SettingsFile:
         except ConfigError as error:
             raise ConfigError(f"{self._label}: {section}: {error}") from error
 
+    def plain[ConfigT: Config](self, config_type: type[ConfigT], node: str) -> ConfigT:
+        """Settings of a node that stand in no group, `topics` aside, as its full name has them.
+
+        Other keys are left alone: they concern the node as a node.
+
+        Raises
+        ------
+        ConfigError
+            If a value has the wrong type or is out of its range.
+        """
+        names = {field.name for field in fields(config_type)}
+        merged: _Tree = {}
+        for pattern, values in self._parts:
+            if _matches(pattern, node):
+                own = {key: value for key, value in values.items() if key in names}
+                _check_types(self._label, "", config_type, own)
+                merged = _merge(merged, own)
+        try:
+            return config_type.from_dict(merged)
+        except ConfigError as error:
+            raise ConfigError(f"{self._label}: {error}") from error
+
 
 class _Loader(yaml.SafeLoader):
     """Refuses a key that is there twice: YAML would silently drop the first."""
@@ -149,7 +173,11 @@ def _load(path: Path) -> _Tree:
 
 def _split(label: str, content: _Tree) -> list[tuple[str, _Tree]]:
     """``(node pattern, nested values)``, the most general pattern first."""
-    plain = {key: value for key, value in content.items() if key.split(".")[0] in SECTIONS}
+    plain = {
+        key: value
+        for key, value in content.items()
+        if key.split(".")[0] in SECTIONS or key in _SENSOR_SETTINGS
+    }
     parts = [(_EVERY_NODE, _nested(label, "", plain))] if plain else []
     for key, value in content.items():
         if key in plain:
@@ -244,27 +272,26 @@ def _check_heads(label: str, pattern: str, values: _Tree) -> None:
 def _check_types(label: str, name: str, config_type: type[Config], values: Any) -> None:
     """What rclpy would refuse is refused here too, so that a file is right or wrong for both."""
     for key, value in _mapping(label, name, values).items():
+        dotted = f"{name}.{key}" if name else key
         field = next((field for field in fields(config_type) if field.name == key), None)
-        if field is None and f"{name}.{key}" in REMOVED:
-            raise ConfigError(
-                f"{label}: {name}.{key} is no setting any more; {REMOVED[f'{name}.{key}']}"
-            )
+        if field is None and dotted in REMOVED:
+            raise ConfigError(f"{label}: {dotted} is no setting any more; {REMOVED[f'{dotted}']}")
         if field is None:
             known = [field.name for field in fields(config_type)]
             raise ConfigError(
-                f"{label}: {name}.{key} is unknown; {name} has {', '.join(known)}"
+                f"{label}: {dotted} is unknown; {name} has {', '.join(known)}"
                 f"{_nearest(key, known)}"
             )
         default = field.default
         if isinstance(default, Config):
-            _check_types(label, f"{name}.{key}", type(default), value)
+            _check_types(label, dotted, type(default), value)
         elif isinstance(default, float) and type(value) is int:
             raise ConfigError(
-                f"{label}: {name}.{key} is {value}, an integer, expected a float: write {value}.0"
+                f"{label}: {dotted} is {value}, an integer, expected a float: write {value}.0"
             )
         elif not isinstance(default, tuple) and type(value) is not type(default):
             raise ConfigError(
-                f"{label}: {name}.{key} is {value!r} ({type(value).__name__}), "
+                f"{label}: {dotted} is {value!r} ({type(value).__name__}), "
                 f"expected {type(default).__name__}: {field.metadata.get('doc', '')}"
             )
         else:
@@ -276,7 +303,8 @@ def _check_value(label: str, name: str, config_type: type[Config], key: str, val
         config_type(**{key: value})
     except ConfigError as error:
         reason = str(error).removeprefix(f"{config_type.__name__}.{key} ")
-        raise ConfigError(f"{label}: {name}.{key} {reason}") from error
+        dotted = f"{name}.{key}" if name else key
+        raise ConfigError(f"{label}: {dotted} {reason}") from error
 
 
 def _nearest(name: str, known: tuple[str, ...] | list[str]) -> str:

@@ -6,20 +6,26 @@ can be; names only decide between several topics that can be the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from dataclasses import fields as dataclass_fields
 
-from uw_dslam_ros2.core.config import Config, setting
-from uw_dslam_ros2.core.errors import ConfigError, DataError
+from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.findings import WORDS
+from uw_dslam_ros2.io.sensor_settings import SENSOR_ROLES as _SENSORS
+from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
 
-__all__ = ["ROLES", "TopicsConfig", "VehicleTopics", "find_vehicles", "roles_of_type"]
+__all__ = [
+    "ROLES",
+    "TopicsConfig",
+    "VehicleTopics",
+    "base_frame_of",
+    "find_vehicles",
+    "roles_of_type",
+]
 
 ROLES = ("sonar", "velocity", "imu", "depth", "odometry", "fix", "truth", "tf_static")
 """What a topic can be to a mapper."""
 
-_SENSORS = ("sonar", "velocity", "imu", "depth", "odometry", "fix")
 _NAVIGATION = {"velocity", "imu", "odometry"}
 _REQUIRED = ("sonar", "velocity", "imu", "odometry")
 """Roles of which the wrong topic spoils a map; of the others the best guess is taken."""
@@ -67,47 +73,6 @@ _NO_MEASUREMENT = {
     "cmd", "cmd_vel", "command", "desired", "setpoint", "goal", "reference", "target", "camera",
     "rgb", "viewer", "visualization", "debug",
 }  # fmt: skip
-_SAME_ROLE = {"dvl": "velocity", "scan": "sonar", "points": "sonar", "pressure": "depth"}
-
-
-@dataclass(frozen=True, slots=True)
-class TopicsConfig(Config):
-    """Topics by role; an empty one is found by its type.
-
-    A name without a leading slash is below the vehicle's namespace.
-    """
-
-    sonar: str = setting("", doc="topic of the sonar; empty: found by its type")
-    velocity: str = setting("", doc="topic of the DVL or other velocity; empty: found by its type")
-    imu: str = setting("", doc="topic of the IMU or compass; empty: found by its type")
-    depth: str = setting("", doc="topic of the pressure or depth; empty: found by its type")
-    odometry: str = setting(
-        "", doc="topic of the vehicle's own filter (Odometry, PoseStamped); empty: found"
-    )
-    fix: str = setting("", doc="topic of position fixes (USBL, GNSS); empty: found by its type")
-
-    def chosen(self) -> dict[str, str]:
-        """Topics that are set, by role."""
-        values = {f.name: str(getattr(self, f.name)) for f in dataclass_fields(self)}
-        return {role: topic for role, topic in values.items() if topic}
-
-    @classmethod
-    def of_options(cls, options: Iterable[str]) -> TopicsConfig:
-        """From texts ``ROLE=TOPIC``; `ConfigError` names one that is not of that form."""
-        values = {}
-        for text in options:
-            role, is_set, topic = text.partition("=")
-            role = _SAME_ROLE.get(role, role)
-            if not is_set or not topic or role not in _SENSORS:
-                raise ConfigError(
-                    f"topic {text!r}: expected ROLE=TOPIC with a role of {', '.join(_SENSORS)}"
-                )
-            values[role] = topic
-        return cls(**values)
-
-    def over(self, other: TopicsConfig) -> TopicsConfig:
-        """These topics, and those of `other` where none is set here."""
-        return TopicsConfig(**(other.chosen() | self.chosen()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +100,19 @@ def roles_of_type(msgtype: str) -> tuple[str, ...]:
     return _TYPES.get(msgtype, ())
 
 
+def base_frame_of(frames: Collection[str], vehicle_id: str, namespace: str = "") -> str:
+    """Frame of a vehicle's body among those that tf has (without slashes at their ends).
+
+    That of the vehicle's name or namespace; else the only one that ends in base_link.
+    """
+    tail = parts_of(namespace)[-1] or vehicle_id
+    expected = [f"{tail}/base_link", f"{vehicle_id}/base_link", "base_link"]
+    if found := [name for name in expected if name in frames]:
+        return found[0]
+    others = sorted(name for name in frames if parts_of(name)[-1] == "base_link")
+    return others[0] if len(others) == 1 else expected[0]
+
+
 def parts_of(topic: str) -> list[str]:
     """Components of a topic's name."""
     return topic.strip("/").split("/")
@@ -143,7 +121,7 @@ def parts_of(topic: str) -> list[str]:
 def find_vehicles(
     tables: Sequence[Mapping[str, str]],
     names: Sequence[str],
-    chosen: Mapping[str, TopicsConfig] | TopicsConfig = TopicsConfig(),
+    settings_of: Callable[[str], SensorConfig] = lambda _: SensorConfig(),
 ) -> list[VehicleTopics]:
     """Vehicles in tables of topics, and what plays which role for each.
 
@@ -152,7 +130,7 @@ def find_vehicles(
     tables : topic -> type of every topic that has messages, one table for each bag (or one for a
         live graph).
     names : a name for each table, for vehicles whose topics have no namespace.
-    chosen : topics that are set, for all vehicles or by vehicle.
+    settings_of : settings of a vehicle by its name: topics that are set, kinds of input.
 
     Returns
     -------
@@ -179,9 +157,8 @@ def find_vehicles(
         table = {topic: typ for index in indices for topic, typ in tables[index].items()}
         others = [n for _, n in namespaces if n != namespace and _is_below(n, namespace)]
         is_alone = len(namespaces) == 1
-        mine = chosen if isinstance(chosen, TopicsConfig) else chosen.get(vehicle_id)
         topics, unused = topics_of(
-            table, vehicle_id, namespace, mine or TopicsConfig(), others, is_alone=is_alone
+            table, vehicle_id, namespace, settings_of(vehicle_id), others, is_alone=is_alone
         )
         vehicles.append(VehicleTopics(vehicle_id, namespace, topics, tuple(indices), unused))
     return vehicles
@@ -191,7 +168,7 @@ def topics_of(
     table: Mapping[str, str],
     vehicle_id: str,
     namespace: str,
-    chosen: TopicsConfig,
+    settings: SensorConfig,
     others: Sequence[str] = (),
     *,
     is_alone: bool = True,
@@ -208,15 +185,16 @@ def topics_of(
     }
     topics: dict[str, str] = {}
     unused: dict[str, str] = {}
-    set_topics = chosen.chosen()
+    set_topics = settings.topics.chosen()
     for role in (*_SENSORS, "truth"):
+        allowed = {t: typ for t, typ in table.items() if settings.allows(role, typ)}
         if role in set_topics:
             topics[role] = _set_topic(table, vehicle_id, namespace, role, set_topics[role])
             continue
-        found = _candidates(mine, role, namespace)
+        found = _candidates({t: mine[t] for t in mine if t in allowed}, role, namespace)
         is_needless = role == "odometry" and "velocity" in topics
         if not found and is_alone and role != "truth" and not is_needless:
-            found = _candidates(table, role, "")
+            found = _candidates(allowed, role, "")
         if not found:
             continue
         best = found[0]

@@ -8,13 +8,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import uw_dslam_ros2
-from uw_dslam_ros2.cli.mapping import OfflineConfig, map_bag, vehicle_of_bag
+from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recording
 from uw_dslam_ros2.cli.scoring import Truth, read_truth
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.session import load_session, save_session
 from uw_dslam_ros2.io.trajectories import write_tum
+from uw_dslam_ros2.io.vehicles import recordings_of
 from uw_dslam_ros2.sim.mission import MissionConfig
 from uw_dslam_ros2.sim.recording import simulate_mission
 from uw_dslam_ros2.sim.sonar import SonarConfig
@@ -61,11 +62,13 @@ def mapped_bags(
     name: str, bags: tuple[Path, ...], truth: Path, settings: Path | None
 ) -> FleetMission:
     """Map each bag by itself, one after the other."""
-    vehicles = [vehicle_of_bag(bag) for bag in bags]
-    config = OfflineConfig.read(settings, vehicles)
+    recordings = recordings_of(bags)
+    config = OfflineConfig.read(settings, [recording.vehicle_id for recording in recordings])
     submaps: list[Submap] = []
-    for bag, vehicle in zip(bags, vehicles, strict=True):
-        submaps += map_bag(bag, vehicle, config.mapper[vehicle]).submaps
+    for recording in recordings:
+        vehicle = recording.vehicle_id
+        mapped = map_recording(recording, config.mapper[vehicle], config.sensors[vehicle])
+        submaps += mapped.submaps
     return FleetMission(name, tuple(submaps), read_truth(truth))
 
 

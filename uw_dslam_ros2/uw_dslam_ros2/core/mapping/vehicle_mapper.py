@@ -71,7 +71,8 @@ class VehicleMapper:
         self._last_ping_ns: int | None = None
         self._last_key: tuple[int, SE2] | None = None
         self._counts: dict[str, float | int | str] = {
-            "num_pings": 0, "num_pings_dropped": 0, "num_key_pings": 0, "num_matches": 0,
+            "num_pings": 0, "num_pings_dropped": 0, "num_pings_empty": 0, "num_key_pings": 0,
+            "num_matches": 0,
             "num_detections_last": 0, "match_overlap_last": math.nan, "depth_m": math.nan,
         }  # fmt: skip
         self._velocity_ns: int | None = None
@@ -297,6 +298,7 @@ class VehicleMapper:
             "num_navigation_late": navigation.num_late,
             "num_navigation_invalid": navigation.num_invalid,
             "num_navigation_outliers": navigation.num_outliers,
+            **navigation.counts(),
             **navigation.sensor_errors(),
         }
 
@@ -352,6 +354,8 @@ class VehicleMapper:
         stamp_ns = detections.stamp_ns
         self._count("num_pings")
         self._counts["num_detections_last"] = len(detections.points)
+        if not len(detections.points):
+            self._count("num_pings_empty")
         if self._open is None:
             self._begin(stamp_ns)
         assert self._open is not None

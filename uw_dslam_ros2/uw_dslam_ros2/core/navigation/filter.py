@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,7 @@ __all__ = ["NavigationFilter"]
 FloatArray = NDArray[np.float64]
 # At one stamp events are applied in this order, whatever order they came in.
 _ORDER = {YawRate: 0, Yaw: 1, Velocity: 2, Fix: 3, Clone: 4}
+_ROLES: dict[str, tuple[type, ...]] = {"velocity": (Velocity,), "imu": (Yaw, YawRate)}
 _WAIT_FOR_YAW_NS = 1_000_000_000
 _UNKNOWN_HEADING_RAD = math.pi
 
@@ -68,6 +70,7 @@ class NavigationFilter:
         self.num_late = 0
         self.num_invalid = 0
         self.num_outliers = 0
+        self._judged: Counter[tuple[type, bool]] = Counter()
 
     @property
     def is_started(self) -> bool:
@@ -176,6 +179,18 @@ class NavigationFilter:
         )
         return {name: float(value) for name, value in zip(names, state[6:11], strict=True)}
 
+    def counts(self) -> dict[str, int]:
+        """How often measurements were used and refused, by their sensor.
+
+        What is applied again, because an earlier message came late, counts again.
+        """
+        result = {}
+        for role, kinds in _ROLES.items():
+            for name, is_used in (("used", True), ("outliers", False)):
+                total = sum(self._judged[kind, is_used] for kind in kinds)
+                result[f"num_{role}_{name}"] = total
+        return result
+
     def _is_valid(self, *values: float) -> bool:
         if all(math.isfinite(value) for value in values):
             return True
@@ -275,6 +290,7 @@ class NavigationFilter:
         new_state, new_covariance, distance = gated_update(
             state, covariance, innovation, jac, noise, gate
         )
+        self._judged[kind, distance <= gate] += 1
         if distance <= gate:
             if kind in refused:
                 refused = {k: v for k, v in refused.items() if k is not kind}

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 
 from uw_dslam_ros2.core.config import Config, setting
-from uw_dslam_ros2.io.messages import DATA_ORDERS
+from uw_dslam_ros2.io.sensor_settings import SensorConfig
 
 __all__ = [
     "NODE_CONFIGS",
@@ -19,32 +19,10 @@ __all__ = [
 
 
 @dataclass(frozen=True, slots=True)
-class SonarMapperConfig(Config):
+class SonarMapperConfig(SensorConfig):
     """Settings of the sonar mapper as a node; `mapper` holds those of the mapping itself."""
 
     vehicle_id: str = setting("", doc="the vehicle's name; empty: the node's namespace")
-    base_frame: str = setting("", doc="frame of the vehicle's body; empty: <vehicle>/base_link")
-    input: str = setting(
-        "image",
-        choices=("image", "scan", "points"),
-        doc="what the sonar sends: topic sonar, scan or points",
-        is_basic=True,
-    )
-    data_order: str = setting(
-        "range_major",
-        choices=DATA_ORDERS,
-        doc="slowest index of a sonar image's bytes",
-        is_basic=True,
-    )
-    velocity: str = setting(
-        "dvl",
-        choices=("dvl", "twist"),
-        doc="type of the topic dvl: Dvl or TwistWithCovarianceStamped",
-        is_basic=True,
-    )
-    water_density_kg_m3: float = setting(
-        1025.0, 900.0, 1300.0, "turns pressure into depth; fresh water has 1000"
-    )
     is_reliable: bool = setting(
         False,
         doc="subscribe to sensors reliably: for replays, where nothing may be lost",
