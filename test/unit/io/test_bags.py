@@ -7,7 +7,7 @@ import pytest
 from backports import zstd
 from rosbags import rosbag1
 from rosbags.typesys import Stores, get_typestore
-from unit.io.bag_messages import SECOND, write_vehicle
+from unit.io.bag_messages import SECOND, sonar_image, write_vehicle
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.io.bags import (
@@ -22,7 +22,10 @@ from uw_dslam_ros2.io.bags import (
     open_bag,
     read_events,
 )
+from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.outgoing import MessageFactory
+from uw_dslam_ros2.io.sensor_settings import TopicsConfig
+from uw_dslam_ros2.io.vehicles import recordings_of
 
 
 def write_bag(path, storage="mcap", **kwargs):
@@ -38,21 +41,23 @@ def storage_file(bag):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_events_are_what_was_written(tmp_path, storage):
-    events = list(read_events(write_bag(tmp_path / "bag", storage)))
+    bag = write_bag(tmp_path / "bag", storage)
+    events = list(read_events(bag))
 
     assert [type(e) for e in events] == [
         TransformEvent,
         ImageEvent,
         ImuEvent,
         VelocityEvent,  # the second one has no bottom lock
-        VelocityEvent,
         DepthEvent,
-        PointsEvent,
         TruthEvent,
     ]
-    assert {e.vehicle_id for e in events} == {"auv_1"}
-    mount, image, imu, dvl, twist, depth, points, truth = events
-    assert [e.stamp_ns // SECOND for e in events[1:]] == [10, 11, 12, 14, 15, 16, 17]
+    mount, image, imu, dvl, depth, truth = events
+    assert [e.stamp_ns // SECOND for e in events[1:]] == [10, 11, 12, 15, 17]
+    others = read_events(bag, topics=TopicsConfig(sonar="points", velocity="velocity"))
+    twist, points = [e for e in others if isinstance(e, VelocityEvent | PointsEvent)]
+    assert [e.stamp_ns // SECOND for e in (twist, points)] == [14, 16]
+    assert {e.vehicle_id for e in (*events, twist, points)} == {"auv_1"}
     assert (mount.frame_id, mount.child_frame_id) == ("auv_1/base_link", "auv_1/dvl")
     assert mount.T_parent_child[:2, 3] == pytest.approx([0.1, 0.2])
     np.testing.assert_array_equal(image.image.intensity[1], [3, 4, 5])
@@ -105,16 +110,24 @@ def test_writing_is_reproducible(tmp_path):
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
-def test_topics_can_be_renamed(tmp_path):
+def test_a_topic_is_found_by_its_type_and_a_vehicle_can_be_named(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         make = MessageFactory(writer.typestore)
         writer.add_topic("/heading", "sensor_msgs/msg/Imu")
         writer.write("/heading", 5, make.imu(5, "imu", 1.0, 0.1, None, 0.0))
-    with pytest.raises(DataError, match="none of its topics is known"):
-        list(read_events(tmp_path / "bag"))
-    (event,) = read_events(tmp_path / "bag", "auv_7", topics={"imu": "/heading"})
+    (event,) = read_events(tmp_path / "bag")
+    assert event.vehicle_id == "bag"
+    (event,) = read_events(tmp_path / "bag", "auv_7")
     assert (event.vehicle_id, event.yaw_rate_rad_s) == ("auv_7", None)
     assert event.yaw_rad == pytest.approx(1.0)
+
+
+def test_a_bag_without_a_topic_that_is_read(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/auv_1/name", "std_msgs/msg/String")
+        writer.write("/auv_1/name", 5, writer.typestore.types["std_msgs/msg/String"]("x"))
+    with pytest.raises(DataError, match="none of the topics has a type that is read"):
+        list(read_events(tmp_path / "bag"))
 
 
 def test_missing_file(tmp_path):
@@ -248,17 +261,26 @@ def test_wrong_topic_type(tmp_path):
         make = MessageFactory(writer.typestore)
         writer.add_topic("/auv_1/sonar", "sensor_msgs/msg/Imu")
         writer.write("/auv_1/sonar", 5, make.imu(5, "imu", 1.0, 0.1, None, 0.0))
-    with pytest.raises(DataError, match=r"/auv_1/sonar has type .*Imu, expected .*Projected"):
-        list(read_events(tmp_path / "bag"))
+    with pytest.raises(DataError, match=r"/auv_1/sonar has type .*Imu, which cannot be its sonar"):
+        list(read_events(tmp_path / "bag", topics=TopicsConfig(sonar="sonar")))
 
 
 def test_malformed_message_names_bag_topic_and_field(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         make = MessageFactory(writer.typestore)
-        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
-        writer.write("/auv_1/imu", 5, make.imu(5, "imu", None, 0.1, float("nan"), 0.0))
-    with pytest.raises(DataError, match=r"bag: bad message on /auv_1/imu .*angular_velocity\.z"):
+        writer.add_topic("/auv_1/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+        for stamp_ns, beam_count in ((5, 3), (6, 4), (7, 3)):
+            message = make.sonar_image("sonar", sonar_image(stamp_ns))
+            message.image.beam_count = beam_count
+            writer.write("/auv_1/sonar", stamp_ns, message)
+    with pytest.raises(DataError, match=r"bag: bad message on /auv_1/sonar .*beam_count"):
         list(read_events(tmp_path / "bag"))
+    (recording,) = recordings_of([tmp_path / "bag"])
+    with VehicleReader(recording) as reader:
+        assert [event.stamp_ns for event in reader.events()] == [5, 7]
+        count = reader.counts["sonar"]
+    assert (count.num, count.num_bad) == (3, 1)
+    assert "beam_count" in count.problem
 
 
 def test_message_that_does_not_fit_its_type(tmp_path):

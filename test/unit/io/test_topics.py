@@ -5,7 +5,8 @@ import itertools
 import pytest
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError
-from uw_dslam_ros2.io.topics import TopicsConfig, find_vehicles
+from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
+from uw_dslam_ros2.io.topics import find_vehicles
 
 SONAR = "marine_acoustic_msgs/msg/ProjectedSonarImage"
 DVL = "marine_acoustic_msgs/msg/Dvl"
@@ -28,6 +29,10 @@ STRANGERS = {
     "/ship/odom": ODOMETRY,
     "/ship/imu": IMU,
 }
+
+
+def settings_of(**topics):
+    return lambda _: SensorConfig(topics=TopicsConfig(**topics))
 
 
 def table(namespace, leaves="plain", *, has_truth=True):
@@ -108,7 +113,7 @@ def test_of_two_that_are_alike_the_user_must_choose():
     with pytest.raises(DataError, match=r"auv_1: two topics could be its imu: /auv_1/imu_a and "):
         find_vehicles([topics], ["bag"])
     for name in ("imu_b", "/auv_1/imu_b"):
-        (vehicle,) = find_vehicles([topics], ["bag"], TopicsConfig(imu=name))
+        (vehicle,) = find_vehicles([topics], ["bag"], settings_of(imu=name))
         assert vehicle.topics["imu"] == "/auv_1/imu_b"
 
 
@@ -120,9 +125,9 @@ def test_raw_data_go_behind_what_the_driver_made_of_them():
 
 def test_a_topic_that_is_set_must_be_there_and_fit():
     with pytest.raises(DataError, match="no topic /auv_1/mavros/imu for its imu; there are /auv_"):
-        find_vehicles([table("/auv_1")], ["bag"], TopicsConfig(imu="mavros/imu"))
+        find_vehicles([table("/auv_1")], ["bag"], settings_of(imu="mavros/imu"))
     with pytest.raises(DataError, match=r"/auv_1/dvl has type .*Dvl, which cannot be its imu"):
-        find_vehicles([table("/auv_1")], ["bag"], TopicsConfig(imu="dvl"))
+        find_vehicles([table("/auv_1")], ["bag"], settings_of(imu="dvl"))
 
 
 def test_topics_as_options():

@@ -202,7 +202,12 @@ def map_recording(
         recording.vehicle_id,
         tuple(newest[key] for key in sorted(newest)),
         mapper.diagnostics(),
-        (*findings, *_unmounted(mountings, recording.vehicle_id), *health_findings(vehicle)),
+        (
+            *findings,
+            *reader.findings,
+            *_unmounted(mountings, recording.vehicle_id),
+            *health_findings(vehicle),
+        ),
     )
 
 

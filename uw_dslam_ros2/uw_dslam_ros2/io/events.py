@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import heapq
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +18,13 @@ from uw_dslam_ros2.core.clocks import StreamTimes, corrected_clocks
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io import messages
+from uw_dslam_ros2.io.drivers import ADAPTERS, ReadSettings
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
     Event,
     ImageEvent,
     ImuEvent,
     PointsEvent,
-    Reading,
     ScanEvent,
     TransformEvent,
     TruthEvent,
@@ -63,7 +65,9 @@ def read_events(
     topics: TopicsConfig | None = None,
     water_density_kg_m3: float = 1025.0,
 ) -> Iterator[Event]:
-    """Events of one or several bags, fixed transforms first, vehicle after vehicle.
+    """Events of one or several bags, fixed transforms first.
+
+    Those of each vehicle in order of recording, vehicles merged by the stamps.
 
     Parameters
     ----------
@@ -101,8 +105,9 @@ def read_events(
         ]
         for reader in readers:
             yield from reader.transforms()
-        for reader in readers:
-            yield from reader.events()
+        yield from heapq.merge(
+            *(reader.events() for reader in readers), key=lambda event: event.stamp_ns
+        )
 
 
 @dataclass(slots=True)
@@ -137,11 +142,15 @@ class VehicleReader:
         is_strict: bool = False,
     ) -> None:
         self._recording = recording
-        self._settings = settings
         self._is_strict = is_strict
         self._roles = {topic: role for role, topic in recording.topics.items()}
         self._readers: list[BagReader] = []
         self._stack = ExitStack()
+        self.findings: list[Finding] = []
+        self._read_settings = {
+            role: settings.read_settings(recording.vehicle_id, role, self.findings.append)
+            for role in recording.topics
+        }
         self.counts: dict[str, MessageCount] = {role: MessageCount() for role in recording.topics}
         self.stamps: dict[str, np.ndarray[Any, np.dtype[np.int64]]] = {}
 
@@ -226,7 +235,11 @@ class VehicleReader:
             if hasattr(msg, "header"):
                 stamp = msg.header.stamp
                 stamp.sec, stamp.nanosec = divmod(stamp_ns, _SECOND_NS)
-        return readings_of(role, raw.msgtype, msg, self._recording.vehicle_id, self._settings)
+        found = readings_of(raw.msgtype, msg, self._read_settings[role])
+        if not hasattr(msg, "header"):
+            time_ns = raw.stamp_ns if stamp_ns is None else stamp_ns
+            found = [dataclasses.replace(event, stamp_ns=time_ns) for event in found]
+        return found
 
     def _sensor_topics(self) -> list[list[str]]:
         return [[t for t in self._roles if t in reader.topics] for reader in self._readers]
@@ -256,63 +269,15 @@ def _transforms_of(msg: Any, vehicle_id: str) -> Iterator[TransformEvent]:
 # -----------------------------------------------------------------------------------------------
 
 
-def readings_of(
-    role: str, msgtype: str, msg: Any, vehicle_id: str, settings: SensorConfig
-) -> Sequence[Event]:
-    """What a message says in its role; nothing where it says that it holds nothing.
+def readings_of(msgtype: str, msg: Any, settings: ReadSettings) -> Sequence[Event]:
+    """What a message says in the role of `settings`; nothing where it holds nothing.
 
     Raises
     ------
     InvalidInputError
         Naming the field that is malformed.
     """
-    key = (vehicle_id, messages.stamp_of(msg), str(msg.header.frame_id))
-    if role == _TRUTH:
+    if settings.role == _TRUTH:
+        key = (settings.vehicle_id, messages.stamp_of(msg), str(msg.header.frame_id))
         return [TruthEvent(*key, messages.pose_of_odometry(msg))]
-    reading = _CONVERTERS[msgtype](key, msg, settings)
-    return [] if reading is None else [reading]
-
-
-_Key = tuple[str, int, str]
-"""Vehicle, stamp [ns], frame: how every event begins."""
-
-
-def _image(key: _Key, msg: Any, settings: SensorConfig) -> Reading:
-    return ImageEvent(*key, messages.sonar_image_of(msg, settings.data_order))
-
-
-def _imu(key: _Key, msg: Any, _: SensorConfig) -> Reading:
-    return ImuEvent(*key, *messages.readings_of_imu(msg))
-
-
-def _dvl(key: _Key, msg: Any, _: SensorConfig) -> Reading | None:
-    value = messages.velocity_of_dvl(msg)
-    return None if value is None else VelocityEvent(*key, *value, is_z_down=True)
-
-
-def _twist(key: _Key, msg: Any, _: SensorConfig) -> Reading | None:
-    value = messages.velocity_of_twist(msg)
-    return None if value is None else VelocityEvent(*key, *value)
-
-
-def _depth(key: _Key, msg: Any, settings: SensorConfig) -> Reading:
-    return DepthEvent(*key, messages.depth_of_pressure(msg, settings.water_density_kg_m3))
-
-
-def _scan(key: _Key, msg: Any, _: SensorConfig) -> Reading:
-    return ScanEvent(*key, *messages.scan_of_laser_scan(msg))
-
-
-def _points(key: _Key, msg: Any, _: SensorConfig) -> Reading:
-    return PointsEvent(*key, messages.points_of_cloud(msg))
-
-
-_CONVERTERS: dict[str, Callable[[_Key, Any, SensorConfig], Reading | None]] = {
-    "marine_acoustic_msgs/msg/ProjectedSonarImage": _image,
-    "sensor_msgs/msg/Imu": _imu,
-    "marine_acoustic_msgs/msg/Dvl": _dvl,
-    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
-    "sensor_msgs/msg/FluidPressure": _depth,
-    "sensor_msgs/msg/LaserScan": _scan,
-    "sensor_msgs/msg/PointCloud2": _points,
-}
+    return ADAPTERS[msgtype].read(msg, settings)

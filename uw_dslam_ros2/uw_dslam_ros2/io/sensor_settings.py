@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.io.messages import DATA_ORDERS
+from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.io.drivers import ReadSettings
+from uw_dslam_ros2.io.drivers.settings import CHOICES, DATA_ORDERS
 
 __all__ = ["INPUT_TYPES", "SENSOR_ROLES", "VELOCITY_TYPES", "SensorConfig", "TopicsConfig"]
 
@@ -98,7 +100,44 @@ class SensorConfig(Config):
         1025.0, 900.0, 1300.0, "turns pressure into depth; fresh water has 1000"
     )
 
+    image_aperture_rad: float = setting(
+        0.0, 0.0, 6.3, "opening of the fan in a plain Image, which does not say it [rad]"
+    )
+    image_max_range_m: float = setting(0.0, 0.0, 1000.0, "range of its farthest row [m]")
+    image_min_range_m: float = setting(0.0, 0.0, 1000.0, "range where its nearest row begins [m]")
+    image_nearest_row: str = setting(
+        "top", choices=CHOICES["image_nearest_row"], doc="row of a plain Image that is nearest"
+    )
+    image_first_column: str = setting(
+        "port",
+        choices=CHOICES["image_first_column"],
+        doc="side to which the left column of a plain Image looks",
+    )
+    sonar_angle_unit: str = setting(
+        "radian", choices=CHOICES["sonar_angle_unit"], doc="unit of SonarEcho.angle"
+    )
+    scan_period_s: float = setting(
+        0.0, 0.0, 600.0, "time of a turn of a LaserScan [s]; 0: as the message says"
+    )
+    scan_stamp: str = setting(
+        "first", choices=CHOICES["scan_stamp"], doc="ray that a LaserScan's stamp belongs to"
+    )
+    point_max_height_m: float = setting(
+        1.0, 0.0, 1000.0, "points further above or below their frame's plane are left out [m]"
+    )
+    pressure: str = setting(
+        "auto", choices=CHOICES["pressure"], doc="what a pressure is measured against"
+    )
     topics: TopicsConfig = TopicsConfig()
+
+    def read_settings(
+        self, vehicle_id: str, role: str, tell: Callable[[Finding], None]
+    ) -> ReadSettings:
+        """These settings, for the adapter of one topic."""
+        own = {field.name for field in dataclass_fields(SensorConfig)}
+        shared = [f.name for f in dataclass_fields(ReadSettings) if f.name in own]
+        values = {name: getattr(self, name) for name in shared}
+        return ReadSettings(vehicle_id=vehicle_id, role=role, tell=tell, **values)
 
     def allows(self, role: str, msgtype: str) -> bool:
         """Whether a topic of this type may play this role."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.findings import WORDS
+from uw_dslam_ros2.io.drivers import ADAPTERS
 from uw_dslam_ros2.io.sensor_settings import SENSOR_ROLES as _SENSORS
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
 
@@ -30,32 +31,26 @@ _NAVIGATION = {"velocity", "imu", "odometry"}
 _REQUIRED = ("sonar", "velocity", "imu", "odometry")
 """Roles of which the wrong topic spoils a map; of the others the best guess is taken."""
 
-_TYPES: dict[str, tuple[str, ...]] = {
-    "marine_acoustic_msgs/msg/ProjectedSonarImage": ("sonar",),
-    "sensor_msgs/msg/LaserScan": ("sonar",),
-    "sensor_msgs/msg/PointCloud2": ("sonar",),
-    "marine_acoustic_msgs/msg/Dvl": ("velocity",),
-    "geometry_msgs/msg/TwistWithCovarianceStamped": ("velocity",),
-    "sensor_msgs/msg/Imu": ("imu",),
-    "sensor_msgs/msg/FluidPressure": ("depth",),
-    "nav_msgs/msg/Odometry": ("odometry",),
-    "tf2_msgs/msg/TFMessage": ("tf_static",),
-}
-
 # A type that says what it is goes before one that can hold anything.
 _GENERAL_TYPES = {
     "sensor_msgs/msg/LaserScan": 1,
     "sensor_msgs/msg/PointCloud2": 2,
     "sensor_msgs/msg/PointCloud": 2,
     "sensor_msgs/msg/Image": 3,
+    "sensor_msgs/msg/CompressedImage": 4,
     "geometry_msgs/msg/TwistWithCovarianceStamped": 1,
     "geometry_msgs/msg/TwistStamped": 2,
+    "geometry_msgs/msg/Twist": 3,
     "geometry_msgs/msg/PoseWithCovarianceStamped": 1,
     "geometry_msgs/msg/PoseStamped": 2,
     "nav_msgs/msg/Odometry": 1,
 }
 # Most of these topics come from something else: only a name makes one a sensor.
-_NEEDS_A_NAME = {"sensor_msgs/msg/Image", "std_msgs/msg/Float32", "std_msgs/msg/Float64"}
+_NEEDS_A_NAME = {
+    "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "std_msgs/msg/Float32",
+    "std_msgs/msg/Float64", "geometry_msgs/msg/Twist", "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PointStamped",
+}  # fmt: skip
 _NAMES = {
     "sonar": (
         "sonar", "oculus", "gemini", "ping360", "blueview", "aris", "didson", "fls", "mbes",
@@ -63,15 +58,15 @@ _NAMES = {
     ),
     "velocity": ("dvl", "velocity", "nucleus", "twist"),
     "imu": ("imu", "ahrs"),
-    "depth": ("depth", "pressure"),
-    "odometry": ("odometry", "odom", "ekf", "filtered"),
+    "depth": ("depth", "pressure", "baro"),
+    "odometry": ("odometry", "odom", "ekf", "filtered", "pose", "localization"),
     "fix": ("fix", "usbl", "gps", "gnss", "navsat"),
 }  # fmt: skip
 _TRUTH = {"truth", "ground_truth", "groundtruth", "gt"}
 # Not measurements: what somebody wants, what has been made of a sensor, or a camera.
 _NO_MEASUREMENT = {
-    "cmd", "cmd_vel", "command", "desired", "setpoint", "goal", "reference", "target", "camera",
-    "rgb", "viewer", "visualization", "debug",
+    "cmd", "command", "desired", "setpoint", "goal", "reference", "target", "camera", "viewer",
+    "visualization", "debug", "waypoint",
 }  # fmt: skip
 
 
@@ -97,7 +92,9 @@ class VehicleTopics:
 
 def roles_of_type(msgtype: str) -> tuple[str, ...]:
     """Roles that a topic of this type can play; none for a type that nobody here reads."""
-    return _TYPES.get(msgtype, ())
+    if msgtype == "tf2_msgs/msg/TFMessage":
+        return ("tf_static",)
+    return ADAPTERS[msgtype].roles if msgtype in ADAPTERS else ()
 
 
 def base_frame_of(frames: Collection[str], vehicle_id: str, namespace: str = "") -> str:
@@ -239,18 +236,19 @@ def _candidates(table: Mapping[str, str], role: str, namespace: str) -> list[_Ra
         parts = [part.lower() for part in parts_of(topic)]
         is_truth = bool(_TRUTH & set(parts))
         if role == "truth":
-            if is_truth and "odometry" in roles_of_type(msgtype):
+            if is_truth and msgtype == "nav_msgs/msg/Odometry":
                 found.append((0, 0, len(parts), 0, topic))
             continue
-        if is_truth or role not in roles_of_type(msgtype) or _NO_MEASUREMENT & set(parts[depth:]):
-            continue
         own = parts[depth:]
+        roles = roles_of_type(msgtype)
+        if is_truth or role not in roles or _is_no_measurement(own):
+            continue
         words = _NAMES[role]
         if own == [words[0]] or (len(own) == 1 and own[0] in words):
             name = 0
         else:
             name = 1 if any(word in part for part in own for word in words) else 2
-        if name == 2 and msgtype in _NEEDS_A_NAME:
+        if name == 2 and (msgtype in _NEEDS_A_NAME or role != roles[0] or _is_named(own, roles)):
             continue
         is_raw = any("raw" in part or "debug" in part for part in own)
         found.append((_GENERAL_TYPES.get(msgtype, 0), name, len(own), int(is_raw), topic))
@@ -267,6 +265,16 @@ def _first_of_parts(tables: Sequence[Mapping[str, str]], names: Sequence[str]) -
     return names[bare[0]] if len(bare) > 1 and all(is_split) else ""
 
 
+def _is_named(parts: Sequence[str], roles: Sequence[str]) -> bool:
+    """Whether a topic's name says one of these roles."""
+    words = [word for role in roles for word in _NAMES.get(role, ())]
+    return any(word in part for part in parts for word in words)
+
+
+def _is_no_measurement(parts: Sequence[str]) -> bool:
+    return any(word in part for part in parts for word in _NO_MEASUREMENT)
+
+
 # --- whose it is
 # -----------------------------------------------------------------------------------------------
 
@@ -281,8 +289,11 @@ def _namespaces(table: Mapping[str, str]) -> list[str]:
     for topic, msgtype in table.items():
         parts = parts_of(topic)
         roles = {role for role in roles_of_type(msgtype) if role in _SENSORS}
-        lowered = {part.lower() for part in parts}
-        if roles and not lowered & (_TRUTH | _NO_MEASUREMENT):
+        lowered = [part.lower() for part in parts]
+        is_nameless = msgtype in _NEEDS_A_NAME and not _is_named(lowered, tuple(roles))
+        if roles and not _TRUTH & set(lowered) and not _is_no_measurement(lowered):
+            if is_nameless:
+                continue
             sensors[tuple(parts)] = roles
     return ["/".join(found) for found in _split(sensors, ())]
 
