@@ -276,7 +276,7 @@ def test_best_effort_driver_is_heard(ros_context, spinning):
     ("namespace", "settings", "words"),
     [
         ("", {}, "vehicle_id is empty and the node has no namespace"),
-        ("auv_1", {"input": "lidar"}, "input is 'lidar', expected one of image, scan, points"),
+        ("auv_1", {"input": "lidar"}, "input is 'lidar', expected one of any, image, scan"),
         ("auv_1", {"mapper.submap.max_length": 3.0}, "did you mean mapper.submap.max_length_m"),
     ],
 )

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from uw_dslam_ros2.cli import offline
-from uw_dslam_ros2.io.bags import BagReader, open_bag
+from uw_dslam_ros2.io.bags import BagWriter, open_bag
+from uw_dslam_ros2.io.vehicles import find_recordings
 from uw_dslam_ros2.sim.mission import tiny_mission_config
 from uw_dslam_ros2.sim.recording import RecordedMission, simulate_mission
 
@@ -61,10 +62,10 @@ def test_offline_merges_and_gives_the_same_bytes_again(mission, tmp_path, capsys
     assert scores["map"]["wall_iou_tolerant"] > 0.5
 
 
-def test_two_bags_of_one_vehicle_are_refused(mission, tmp_path, capsys) -> None:
+def test_a_bag_that_is_named_twice_is_refused(mission, tmp_path, capsys) -> None:
     bag = str(mission.bags[0])
     assert offline.main([bag, bag, "--out", str(tmp_path / "out")]) == 2
-    assert "two bags are of auv_1" in capsys.readouterr().err
+    assert "is named twice" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -88,8 +89,23 @@ def test_settings_are_checked_before_anything_is_mapped(mission, tmp_path, capsy
     assert "did you mean max_length_m?" in capsys.readouterr().err
 
 
-def test_a_bag_belongs_to_one_vehicle(mission) -> None:
-    for vehicle_id, bag in zip(mission.vehicle_ids, mission.bags, strict=True):
-        assert offline.vehicle_of_bag(bag) == vehicle_id
-        with open_bag(bag) as reader:
-            assert isinstance(reader, BagReader)
+def test_vehicles_are_found_and_can_be_named(mission) -> None:
+    found, findings = find_recordings(mission.bags)
+    assert [recording.vehicle_id for recording in found] == list(mission.vehicle_ids)
+    assert [recording.bags for recording in found] == [(bag,) for bag in mission.bags]
+    assert findings == []
+    (named,), _ = find_recordings([], named={"mine": [mission.bags[0]]})
+    assert (named.vehicle_id, named.namespace) == ("mine", mission.vehicle_ids[0])
+
+
+def test_no_sonar_is_no_map(mission, tmp_path, capsys) -> None:
+    with open_bag(mission.bags[0]) as reader, BagWriter(tmp_path / "blind") as writer:
+        for topic in ("/auv_1/imu", "/auv_1/dvl", "/tf_static"):
+            writer.add_topic(topic, reader.topics[topic])
+        for raw in reader.raw(["/auv_1/imu", "/auv_1/dvl", "/tf_static"]):
+            writer.write_raw(raw.topic, raw.stamp_ns, raw.data)
+    assert offline.main([str(tmp_path / "blind"), "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "auv_1: nothing was mapped" in error
+    assert "sonar: there is no topic" in error
+    assert not (tmp_path / "out").exists()

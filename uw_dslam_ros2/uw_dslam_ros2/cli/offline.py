@@ -79,6 +79,12 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(args: argparse.Namespace) -> int:
     started_s = time.monotonic()
+    named = _named_bags(args.vehicle)
+    bags = [*args.bags, *(bag for own in named.values() for bag in own)]
+    if not bags:
+        raise DataError("no bags are named; expected at least one")
+    if missing := [bag for bag in bags if not bag.exists()]:
+        raise DataError(f"{missing[0]} does not exist; expected a recording")
     file = SettingsFile(args.config)
     topics = TopicsConfig.of_options(args.topic)
 
@@ -86,10 +92,6 @@ def _run(args: argparse.Namespace) -> int:
         own = sensor_config(file, vehicle_id)
         return dataclasses.replace(own, topics=topics.over(own.topics))
 
-    named = _named_bags(args.vehicle)
-    bags = [*args.bags, *(bag for own in named.values() for bag in own)]
-    if not bags:
-        raise DataError("no bags are named; expected at least one")
     recordings, findings = find_recordings(args.bags, settings_of, named)
     vehicles = [recording.vehicle_id for recording in recordings]
     config = OfflineConfig.read(args.config, vehicles)

@@ -44,11 +44,12 @@ def sensor_inputs(config: SonarMapperConfig, vehicle_id: str) -> tuple[SensorInp
     """Pings, velocity, heading and depth, as the settings name them."""
     reader = _Reader(config, vehicle_id)
     ping_type, ping_topic, to_event = {
+        "any": (ProjectedSonarImage, "sonar", reader.image),
         "image": (ProjectedSonarImage, "sonar", reader.image),
         "scan": (LaserScan, "scan", reader.scan),
         "points": (PointCloud2, "points", reader.points),
     }[config.input]
-    velocity_type = Dvl if config.velocity == "dvl" else TwistWithCovarianceStamped
+    velocity_type = Dvl if config.velocity != "twist" else TwistWithCovarianceStamped
     return (
         SensorInput(ping_type, ping_topic, to_event, _PING_QUEUE),
         SensorInput(velocity_type, "dvl", reader.velocity, _SENSOR_QUEUE),
@@ -91,7 +92,7 @@ class _Reader:
 
     def velocity(self, msg: Any) -> SensorEvent | None:
         """Velocity over ground; None without bottom lock."""
-        is_dvl = self._config.velocity == "dvl"
+        is_dvl = self._config.velocity != "twist"
         value = messages.velocity_of_dvl(msg) if is_dvl else messages.velocity_of_twist(msg)
         if value is None:
             return None
