@@ -230,7 +230,7 @@ def _unmounted(mountings: Mountings, vehicle_id: str) -> list[Finding]:
         Finding(
             "no_mounting",
             "velocity" if word == "dvl" else word,
-            f"no transform says where its frame {frame_id!r} is on the vehicle; it is taken to sit "
+            f"no transform says where its frame {frame_id!r} sits; it is taken to sit "
             "at the origin, level and looking ahead",
             vehicle_id=vehicle_id,
         )
