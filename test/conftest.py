@@ -5,6 +5,7 @@ import itertools
 import os
 import socket
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,14 +15,27 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("uw", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("uw")
 
-FIRST_DOMAIN, LAST_DOMAIN = 1, 100
+TESTS = Path(__file__).parent
 DEADLINE_S = 30.0
+# Each test takes the next, for in one that was just left something may still be heard.
+_domains = itertools.cycle(range(1, 101))
 
 
 def pytest_configure():
     # Where ROS is promised, node tests must not be skipped for want of it.
     if os.environ.get("UW_REQUIRE_ROS") == "1":
         import rclpy  # noqa: F401
+
+
+def pytest_collection_modifyitems(items):
+    """Tell pytest-xdist what stays together.
+
+    Tests of a file share fixtures. Those with nodes measure times, so no two of them run at once.
+    """
+    for item in items:
+        file = item.path.relative_to(TESTS)
+        group = "nodes" if file.parts[0] in ("node", "system") else str(file)
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture
@@ -33,7 +47,7 @@ def rng():
 @pytest.fixture
 def ros_domain_id():
     """A DDS domain that no other test on this machine uses while this one runs."""
-    for domain_id in itertools.cycle(range(FIRST_DOMAIN, LAST_DOMAIN + 1)):
+    for domain_id in _domains:
         claim = socket.socket()
         try:
             claim.bind(("127.0.0.1", 21000 + domain_id))
