@@ -31,10 +31,14 @@ def pytest_collection_modifyitems(items):
     """Tell pytest-xdist what stays together.
 
     Tests of a file share fixtures. Those with nodes measure times, so no two of them run at once.
+    Where kernels are compiled with checks, tests of a folder share them, and compile them once.
     """
+    is_checked = os.environ.get("NUMBA_BOUNDSCHECK", "0") != "0"
     for item in items:
         file = item.path.relative_to(TESTS)
-        group = "nodes" if file.parts[0] in ("node", "system") else str(file)
+        group = str(file.parent if is_checked else file)
+        if file.parts[0] in ("node", "system"):
+            group = "nodes"
         item.add_marker(pytest.mark.xdist_group(group))
 
 

@@ -11,6 +11,8 @@ from uw_dslam_ros2.core.grid import UNSEEN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mosaic import Mosaic, Window, fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 
+pytestmark = pytest.mark.kernels
+
 LATTICE = GridSpec(1.0, 1, 1)
 HAND_MADE = OccupancyMap(
     GridSpec(1.0, 2, 3, SE2(-1.0, -1.0)), np.array([[0, 100, -1], [0, 0, 100]], dtype=np.int8)

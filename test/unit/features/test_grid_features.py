@@ -10,6 +10,8 @@ from uw_dslam_ros2.core.features.walls import wall_points
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 
+pytestmark = pytest.mark.kernels
+
 
 def _map(values: np.ndarray, resolution_m: float = 0.1, **kwargs: SE2) -> OccupancyMap:
     return OccupancyMap(GridSpec(resolution_m, *values.shape, **kwargs), values.astype(np.int8))

@@ -8,6 +8,8 @@ from uw_dslam_ros2.core.mapping.match_kernels import score_poses, score_window
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.se2 import SE2
 
+pytestmark = pytest.mark.kernels
+
 SIGMA = 0.12
 
 

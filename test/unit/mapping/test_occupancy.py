@@ -14,6 +14,8 @@ from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import Detections
 
+pytestmark = pytest.mark.kernels
+
 CONFIG = OccupancyConfig(resolution_m=0.1, free_range_max_m=8.0)
 
 

@@ -11,6 +11,8 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.navigation import NavigationConfig, NavigationFilter
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
+pytestmark = pytest.mark.kernels
+
 S = 1_000_000_000
 
 

@@ -11,6 +11,8 @@ from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN
 from uw_dslam_ros2.sim.floor_plans import PLACE_KINDS, make_place
 from uw_dslam_ros2.sim.map_pairs import MapNoise, damage, make_pair, observe
 
+pytestmark = pytest.mark.kernels
+
 
 def _near_share(pair, T_target_source) -> float:
     """Share of the source's walls inside the target's window that lie on a wall, by two cells."""

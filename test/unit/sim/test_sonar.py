@@ -12,6 +12,8 @@ from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
 from uw_dslam_ros2.sim.speckle import speckle_statistics
 from uw_dslam_ros2.sim.world import Surface, WorldBuilder
 
+pytestmark = pytest.mark.kernels
+
 WALL = Surface("wall", 0.0, 4.0)
 
 

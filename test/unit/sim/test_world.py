@@ -6,6 +6,8 @@ import pytest
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.sim.world import NO_HIT, Surface, WorldBuilder, cast_rays
 
+pytestmark = pytest.mark.kernels
+
 
 def slow_range(segments, origin, angle, max_range):
     """One ray, one segment at a time, by a linear solve."""

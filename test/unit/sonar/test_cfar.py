@@ -11,6 +11,8 @@ from uw_dslam_ros2.core.sonar.cfar import (
 )
 from uw_dslam_ros2.core.sonar.kernels import cfar_ratio, row_ratio
 
+pytestmark = pytest.mark.kernels
+
 
 def slow_ratio(power, num_train, num_guard, rate, is_smallest_of, floor):
     num_rows, num_beams = power.shape

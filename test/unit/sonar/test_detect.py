@@ -15,6 +15,8 @@ from uw_dslam_ros2.core.sonar import (
     detections_from_scan,
 )
 
+pytestmark = pytest.mark.kernels
+
 FIXED = SonarConfig(segmentation="fixed", fixed_threshold=0.3, neighbor_distance_m=0.0)
 
 

@@ -26,6 +26,8 @@ from uw_dslam_ros2.core.registration.baselines.peers import _flattened, _lifted
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.point_sets import outlier_problem, overlap_problem
 
+pytestmark = pytest.mark.kernels
+
 GLOBAL = [many_start_icp, correlative, pair_voting, go_icp]
 LOCAL = [icp, ndt]
 

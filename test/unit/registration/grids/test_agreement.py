@@ -11,6 +11,8 @@ from uw_dslam_ros2.core.registration.grids.agreement import WallMap, measure_agr
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import make_pair
 
+pytestmark = pytest.mark.kernels
+
 
 @pytest.fixture(scope="module")
 def sides() -> tuple[WallMap, WallMap]:

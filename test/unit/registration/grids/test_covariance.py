@@ -74,6 +74,7 @@ def test_errors_of_other_places_are_about_as_large_as_stated(noise, most):
     assert np.mean(np.array(nees) > 7.81) <= 0.25  # 95 % quantile of three degrees of freedom
 
 
+@pytest.mark.kernels
 def test_a_covariance_is_symmetric_and_positive(pair):
     problem = _problem(pair)
     pose, _ = problem.ascend(_truth(pair, problem))

@@ -13,6 +13,8 @@ from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindo
 from uw_dslam_ros2.core.registration.grids.signed_field import PAD, padded_field
 from uw_dslam_ros2.core.registration.search.field import Field
 
+pytestmark = pytest.mark.kernels
+
 _SHAPES = [((12, 17), (14, 11)), ((3, 30), (9, 9)), ((10, 10), (2, 21))]
 
 

@@ -13,6 +13,8 @@ from uw_dslam_ros2.core.registration.search import kernels
 from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome, SearchSettings, Status
 from uw_dslam_ros2.core.registration.search.problem import Problem
 
+pytestmark = pytest.mark.kernels
+
 
 def _room(rng: np.random.Generator, size: int) -> OccupancyMap:
     """A small room with two random walls."""

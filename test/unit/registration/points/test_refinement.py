@@ -16,6 +16,8 @@ from uw_dslam_ros2.core.registration.points.refinement import Refinement
 from uw_dslam_ros2.core.registration.points.rivals import log_contributions, log_odds
 from uw_dslam_ros2.core.se2 import SE2
 
+pytestmark = pytest.mark.kernels
+
 PLANTED = SE2(0.1, -0.2, 0.7)
 
 

@@ -24,6 +24,8 @@ from uw_dslam_ros2.core.registration.search.field import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 
+pytestmark = pytest.mark.kernels
+
 
 def mixture_term(source, target, sigma=0.15):
     field = mixture_field(target, np.ones(len(target)), np.full(len(target), sigma))
@@ -130,6 +132,7 @@ def exhaustive_best(problem, rng):
     return max(problem.ascend(poses[k])[0] for k in order)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_agrees_with_exhaustive_search(seed):
     rng = np.random.default_rng(seed)

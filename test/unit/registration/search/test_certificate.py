@@ -349,6 +349,7 @@ def is_known(outcome, T):
     return any(is_near(outcome, T, other) for other in known)
 
 
+@pytest.mark.kernels
 def test_rivals_out_of_budget_leave_a_true_bound():
     rng = np.random.default_rng(600)
     problem = of_kind("duplicates", rng)

@@ -12,6 +12,8 @@ from uw_dslam_ros2.core.registration.search.field import (
     mixture_field,
 )
 
+pytestmark = pytest.mark.kernels
+
 
 def exact_mixture(points, centers, weights, sigmas):
     square = ((points[:, None, :] - centers[None, :, :]) ** 2).sum(axis=2)

@@ -25,6 +25,8 @@ from uw_dslam_ros2.core.registration.search.sweep import Sweep
 from uw_dslam_ros2.core.registration.search.sweep_kernels import SIDE
 from uw_dslam_ros2.core.se2 import SE2
 
+pytestmark = pytest.mark.kernels
+
 UTM = np.array([512_345.0, 4_187_654.0])
 WIDTHS = np.array([*sweep_module._WIDTHS, 10**6])
 
