@@ -189,6 +189,18 @@ def test_frames_that_no_transform_mentions_are_told():
     assert mountings.unknown == {"dvl_a50": "dvl"}
 
 
+@pytest.mark.parametrize(
+    ("pitch_deg", "is_told"), [(0, False), (5, False), (20, True), (-20, True)]
+)
+def test_a_sonar_that_points_down_is_told(pitch_deg, is_told):
+    mountings = Mountings("auv_1/base_link")
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("y", pitch_deg, degrees=True).as_matrix()
+    mountings.add(TransformEvent("auv_1", 0, "auv_1/base_link", "auv_1/sonar", matrix))
+    mountings.of(ScanEvent("auv_1", 0, "auv_1/sonar", BEARINGS, BEARINGS + 3.0, 9.0))
+    assert bool(mountings.tilted) is is_told
+
+
 def test_the_vehicles_own_odometry_moves_it_whatever_its_frame():
     ends = []
     for T_any_odom in (SE2(), SE2(100.0, -30.0, 2.0)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import multiprocessing
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -205,7 +206,7 @@ def map_recording(
         (
             *findings,
             *reader.findings,
-            *_unmounted(mountings, recording.vehicle_id),
+            *_mounting_findings(mountings, recording.vehicle_id),
             *health_findings(vehicle),
         ),
     )
@@ -225,8 +226,8 @@ def _mountings(
     return mountings
 
 
-def _unmounted(mountings: Mountings, vehicle_id: str) -> list[Finding]:
-    return [
+def _mounting_findings(mountings: Mountings, vehicle_id: str) -> list[Finding]:
+    unknown = [
         Finding(
             "no_mounting",
             "velocity" if word == "dvl" else word,
@@ -236,6 +237,18 @@ def _unmounted(mountings: Mountings, vehicle_id: str) -> list[Finding]:
         )
         for frame_id, word in sorted(mountings.unknown.items())
     ]
+    tilted = [
+        Finding(
+            "sonar_tilted",
+            "sonar",
+            f"its frame {frame_id!r} points {math.degrees(tilt_rad):.0f} degrees up or down; each "
+            "beam is projected by its middle, but how high an echo lies in the beam is not known, "
+            "so that walls may be some per cent off: mount it level where a true map is wanted",
+            vehicle_id=vehicle_id,
+        )
+        for frame_id, tilt_rad in sorted(mountings.tilted.items())
+    ]
+    return unknown + tilted
 
 
 def settle(

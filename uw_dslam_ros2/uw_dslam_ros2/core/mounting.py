@@ -18,6 +18,7 @@ __all__ = [
     "ForwardAxis",
     "StaticFrames",
     "fan_mount",
+    "fan_tilt",
     "level_rotation",
     "rotation_of_quaternion",
 ]
@@ -94,8 +95,7 @@ def fan_mount(
     rotation, place = T_base_sensor[:3, :3], T_base_sensor[:3, 3]
     if R_level_base is not None:
         rotation, place = np.asarray(R_level_base) @ rotation, np.asarray(R_level_base) @ place
-    if forward is None:
-        forward = "x" if abs(rotation[2, 0]) <= abs(rotation[2, 2]) else "z"
+    forward = forward or _more_level(rotation)
     ahead, to_port = _fan_axes(rotation, forward)
     tilt = math.asin(min(1.0, abs(float(ahead[2]))))
     if not tilt <= _MAX_TILT_RAD:
@@ -109,6 +109,17 @@ def fan_mount(
     seen = SE2(0.0, 0.0, -yaw).apply(np.stack([ahead[:2], to_port[:2]])).T
     is_level = bool(np.abs(seen - np.eye(2)).max() < _LEVEL)
     return FanMount(T_base_fan, None if is_level else seen)
+
+
+def fan_tilt(T_base_sensor: FloatArray, forward: ForwardAxis | None = "x") -> float:
+    """How far the middle of a fan points up or down on a level vehicle [rad]."""
+    rotation = T_base_sensor[:3, :3]
+    ahead, _ = _fan_axes(rotation, forward or _more_level(rotation))
+    return math.asin(min(1.0, abs(float(ahead[2]))))
+
+
+def _more_level(rotation: FloatArray) -> ForwardAxis:
+    return "x" if abs(rotation[2, 0]) <= abs(rotation[2, 2]) else "z"
 
 
 def _fan_axes(rotation: FloatArray, forward: ForwardAxis) -> tuple[FloatArray, FloatArray]:

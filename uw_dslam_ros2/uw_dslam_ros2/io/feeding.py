@@ -14,6 +14,7 @@ from uw_dslam_ros2.core.mapping import VehicleMapper
 from uw_dslam_ros2.core.mounting import (
     StaticFrames,
     fan_mount,
+    fan_tilt,
     level_rotation,
     rotation_of_quaternion,
 )
@@ -42,6 +43,7 @@ SensorEvent = Reading
 
 _PINGS = (ImageEvent, ScanEvent, PointsEvent, BeamsEvent)
 _HOLD_NS = 2_000_000_000
+_NOTABLE_TILT_RAD = math.radians(10.0)  # shortens ranges by 1.5 %
 
 
 def in_stamp_order[EventT](events: Iterable[EventT]) -> Iterator[EventT]:
@@ -81,6 +83,8 @@ class Mountings:
     unknown : dict[str, str]
         Frames that no transform leads from to the body -> kind of reading. They are taken to sit
         at its origin, with the axes that their message's definition says.
+    tilted : dict[str, float]
+        Frames of sonars that point notably up or down -> by how much [rad].
     """
 
     def __init__(self, base_frame_id: str) -> None:
@@ -88,6 +92,7 @@ class Mountings:
         self._frames = StaticFrames()
         self._known: dict[tuple[type, str], FloatArray] = {}
         self.unknown: dict[str, str] = {}
+        self.tilted: dict[str, float] = {}
 
     def add(self, event: TransformEvent) -> None:
         """Take a transform."""
@@ -100,7 +105,11 @@ class Mountings:
         frame_id = event.child_frame_id if isinstance(event, PoseEvent) else event.frame_id
         key = type(event), frame_id
         if key not in self._known:
-            self._known[key] = self._mounting(event, frame_id)
+            mounting = self._known[key] = self._mounting(event, frame_id)
+            if role_of(event) == "sonar":
+                forward = event.forward if isinstance(event, ImageEvent) else "x"
+                if (tilt_rad := fan_tilt(mounting, forward)) > _NOTABLE_TILT_RAD:
+                    self.tilted[frame_id] = tilt_rad
         return self._known[key]
 
     def _mounting(self, event: Reading, frame_id: str) -> FloatArray:
