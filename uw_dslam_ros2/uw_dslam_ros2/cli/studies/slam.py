@@ -46,7 +46,7 @@ from uw_dslam_ros2.io.feeding import Mountings, feed, in_stamp_order
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.trajectories import read_tum
-from uw_dslam_ros2.sim.mission import MissionConfig
+from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
 from uw_dslam_ros2.sim.places import PLACES
 from uw_dslam_ros2.sim.recording import simulate_mission
 
@@ -92,6 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--duration", type=float, default=450.0, help="of each mission [s]")
     parser.add_argument("--ping-rate", type=float, default=2.0, metavar="HZ")
+    parser.add_argument("--sonar", choices=SONAR_KINDS, default="imaging", help="of the missions")
     parser.add_argument(
         "--estimators",
         nargs="+",
@@ -146,6 +147,7 @@ def _cases(args: argparse.Namespace, work: Path) -> Iterator[_Case]:
             num_vehicles=1,
             duration_s=args.duration,
             ping_rate_hz=args.ping_rate,
+            sonar_kind=args.sonar,
         )
         mission = simulate_mission(work / f"{place}_{seed}", config)
         yield _Case(
