@@ -293,6 +293,8 @@ def _start_nodes(children: Children, recordings: _Recordings) -> None:
     for vehicle in recordings.vehicles:
         parameters = ["-r", f"__ns:=/{vehicle}", "-p", "use_sim_time:=true"]
         parameters += ["-p", "is_reliable:=true"]
+        if recordings.ping_topic == "scan":
+            parameters += ["-p", "input:=scan"]
         children.start(f"{vehicle}_sonar_mapper", f"{_NODES}.sonar_mapper", [*ros, *parameters])
     children.start("registration_server", f"{_NODES}.registration_server", ros)
     parameters = ["-p", "use_sim_time:=true"]

@@ -22,6 +22,7 @@ from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io import messages
 from uw_dslam_ros2.io.feeding import SensorEvent, feed
 from uw_dslam_ros2.io.readings import (
+    BeamsEvent,
     DepthEvent,
     ImageEvent,
     PointsEvent,
@@ -53,7 +54,7 @@ from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["SonarMapper", "SonarMapperConfig", "main"]
 
-_PINGS = (ImageEvent, ScanEvent, PointsEvent)
+_PINGS = (ImageEvent, ScanEvent, PointsEvent, BeamsEvent)
 _JUMP_BACK_S = 1.0  # stamps that go back by more begin a new recording
 _PATH_MAX_POSES = 2000  # a longer path is thinned when published
 _MAX_AHEAD_NS = 10_000_000_000

@@ -11,13 +11,14 @@ from marine_acoustic_msgs.msg import Dvl, ProjectedSonarImage
 from sensor_msgs.msg import FluidPressure, Imu, LaserScan, PointCloud2
 
 from uw_dslam_ros2.io import messages
+from uw_dslam_ros2.io.drivers.laser_scan import read_scan
+from uw_dslam_ros2.io.drivers.settings import ReadSettings
 from uw_dslam_ros2.io.feeding import SensorEvent
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
     ImageEvent,
     ImuEvent,
     PointsEvent,
-    ScanEvent,
     VelocityEvent,
 )
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
@@ -51,7 +52,13 @@ def sensor_inputs(config: SonarMapperConfig, vehicle_id: str) -> tuple[SensorInp
     }[config.input]
     velocity_type = Dvl if config.velocity != "twist" else TwistWithCovarianceStamped
     return (
-        SensorInput(ping_type, ping_topic, to_event, _PING_QUEUE),
+        SensorInput(
+            ping_type,
+            ping_topic,
+            to_event,
+            # A scan may hold a single beam.
+            _SENSOR_QUEUE if ping_type is LaserScan else _PING_QUEUE,
+        ),
         SensorInput(velocity_type, "dvl", reader.velocity, _SENSOR_QUEUE),
         SensorInput(Imu, "imu", reader.imu, _SENSOR_QUEUE),
         SensorInput(FluidPressure, "depth", reader.depth, _SENSOR_QUEUE),
@@ -73,9 +80,9 @@ class _Reader:
         image = messages.sonar_image_of(msg, self._config.data_order)
         return ImageEvent(*self._key(msg), image)
 
-    def scan(self, msg: Any) -> SensorEvent:
-        """Ranges over angles."""
-        return ScanEvent(*self._key(msg), *messages.scan_of_laser_scan(msg))
+    def scan(self, msg: Any) -> SensorEvent | None:
+        """Ranges over angles: of one moment, or beams with times of their own."""
+        return next(iter(read_scan(msg, ReadSettings(vehicle_id=self._vehicle_id))), None)
 
     def points(self, msg: Any) -> SensorEvent:
         """Echoes that somebody else found."""
