@@ -209,3 +209,14 @@ def test_malformed_input_is_named(call, what):
 def test_contradicting_gates_are_refused():
     with pytest.raises(ConfigError, match="max_range_m"):
         SonarConfig(min_range_m=5.0, max_range_m=4.0)
+
+
+def test_points_all_round_are_as_far_from_one_another_as_the_beams_of_a_turn():
+    bearing = np.arange(120) * 2 * math.pi / 120
+    ring = 10.0 * np.column_stack([np.cos(bearing), np.sin(bearing)])
+    turn = detections_from_points(0, ring)
+    assert turn.beamwidth_rad == pytest.approx(2 * math.pi / 120)
+    # At 10 m they lie 0.52 m apart: further than neighbours of a fan may.
+    assert len(turn.points) == 120
+    fan = detections_from_points(0, ring[np.abs(np.sin(0.5 * bearing)) < 0.5])
+    assert fan.beamwidth_rad == 0.02

@@ -17,7 +17,7 @@ from uw_dslam_ros2.core.mapping.matcher import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["LocalMap"]
+__all__ = ["LocalMap", "joined"]
 
 FloatArray = NDArray[np.float64]
 _COARSEST = 8.0
@@ -25,6 +25,31 @@ _MIN_POINTS = 20
 """Fewer echoes than this, of the ping or known ones, say too little of a pose."""
 _MAX_POINTS = 300
 """Of more echoes an even choice is matched: more of the same walls add time, not accuracy."""
+
+_WIDE_BEAM_RAD = 0.021
+"""Wider beams leave gaps between the echoes of a wall."""
+
+
+def joined(
+    points: FloatArray, weight: FloatArray, beamwidth_rad: float, step_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Echoes (N, 2) of successive wide beams, and the wall between those that lie near.
+
+    Two turns hear a wall at places that lie further apart than the field is wide; between two
+    beams that are neighbours on it the wall goes on. Beams two widths apart see it at 60 degrees.
+    """
+    if len(points) < 2 or beamwidth_rad < _WIDE_BEAM_RAD:
+        return points, weight
+    steps = np.diff(points, axis=0)
+    length_m = np.hypot(steps[:, 0], steps[:, 1])
+    range_m = np.hypot(points[:-1, 0], points[:-1, 1])
+    is_near = (length_m < 2.0 * beamwidth_rad * range_m) & (length_m > step_m)
+    parts, weights = [points], [weight]
+    for i in np.flatnonzero(is_near):
+        share = np.arange(step_m, length_m[i], step_m)[:, None] / length_m[i]
+        parts.append(points[i] + share * steps[i])
+        weights.append(np.full(len(share), min(weight[i], weight[i + 1])))
+    return np.vstack(parts), np.concatenate(weights)
 
 
 class LocalMap:

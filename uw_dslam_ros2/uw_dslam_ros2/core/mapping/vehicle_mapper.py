@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.estimators import make_estimator
-from uw_dslam_ros2.core.mapping.local_map import LocalMap
+from uw_dslam_ros2.core.mapping.local_map import LocalMap, joined
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.mosaic import Mosaic
@@ -30,7 +30,7 @@ from uw_dslam_ros2.core.sonar import (
     detections_from_scan,
     place_sweep,
 )
-from uw_dslam_ros2.core.sonar.turning import Sweep
+from uw_dslam_ros2.core.sonar.turning import Sweep, beams_of_image
 from uw_dslam_ros2.core.submap import Submap
 
 __all__ = ["VehicleMapper"]
@@ -44,6 +44,8 @@ _TURN_MEMORY_S = 120.0
 """A turn takes up to 35 s, and its message may come when the next one is complete."""
 _AHEAD_NS = 1_000_000_000
 """At the end, beams this much newer than all navigation are placed by its last velocity."""
+_MIN_FAN_BEAMS = 5
+"""Fewer beams in an image are a piece of what a sonar that turns sees."""
 _MIN_OVERLAP = 0.3
 """Least share of a ping's echoes that must meet known ones for a match to be believed."""
 
@@ -147,6 +149,8 @@ class VehicleMapper:
         ``projection`` (2, 2) takes points of a fan that is not level to the plane, before
         ``T_base_sonar``: see `core.mounting.FanMount`.
         """
+        if len(image.bearing_rad) < _MIN_FAN_BEAMS:
+            return self.add_beams(beams_of_image(image), T_base_sonar, projection)
         return self._add(detect(image, self._config.sonar), T_base_sonar, projection)
 
     def add_scan(
@@ -424,7 +428,10 @@ class VehicleMapper:
                 self._navigation.add_fix(stamp_ns, match.T_target_source, match.information)
                 T_submap_base, _ = self._navigation.relative_at(stamp_ns)
         if len(points):
-            self._local_map.add(T_submap_base.apply(points), detections.weight, T_submap_base)
+            walls, weight = joined(
+                points, detections.weight, detections.beamwidth_rad, self._config.match.sigma_m
+            )
+            self._local_map.add(T_submap_base.apply(walls), weight, T_submap_base)
         self._last_key = (stamp_ns, T_submap_base)
 
     def _close(self, drift: FloatArray) -> list[Submap]:

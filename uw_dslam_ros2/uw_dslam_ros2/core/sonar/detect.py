@@ -39,6 +39,8 @@ _NO_ECHO_FREE_SHARE = 0.5
 reflector may have been missed.
 """
 
+_MIN_TURN_POINTS, _MAX_TURN_GAP_RAD, _TURN_SPACING_RAD = 30, 0.5 * np.pi, (0.01, 0.1)
+
 
 def detect(image: SonarImage, config: SonarConfig = SonarConfig()) -> Detections:  # noqa: B008 (frozen)
     """Find the echoes of one ping.
@@ -88,7 +90,8 @@ def detections_from_points(
     """Detections that somebody else has made, (N, 2) [m] in the sonar's frame (x forward, y left).
 
     Which beams met nothing is not known, so the water counts as free only before the nearest point
-    of a bearing.
+    of a bearing. Points all round are a turn of a sonar with a single beam: they lie as far from
+    one another as its beams, and come out in their order.
     """
     xy = np.asarray(points, dtype=np.float64)
     if xy.ndim != 2 or xy.shape[1] != 2:
@@ -98,7 +101,11 @@ def detections_from_points(
     ranges = np.hypot(xy[:, 0], xy[:, 1])
     inside = (ranges >= config.min_range_m) & (ranges < config.max_range_m)
     xy, ranges = xy[inside], ranges[inside]
-    width = config.beamwidth_rad or beam_spacing_rad
+    spacing_rad = _spacing_of_turn(xy)
+    if spacing_rad > 0.0:
+        order = np.argsort(np.arctan2(xy[:, 1], xy[:, 0]), kind="stable")
+        xy, ranges = xy[order], ranges[order]
+    width = config.beamwidth_rad or spacing_rad or beam_spacing_rad
     keep = has_neighbors(xy, width, config)
     beams = np.floor(np.arctan2(xy[:, 1], xy[:, 0]) / width).astype(np.int64)
     unique, inverse = np.unique(beams, return_inverse=True)
@@ -113,6 +120,17 @@ def detections_from_points(
         width,
         config.range_sigma_m,
     )
+
+
+def _spacing_of_turn(points: FloatArray) -> float:
+    """How far points (N, 2) all round lie apart in bearing [rad]; 0: they are not all round."""
+    if len(points) < _MIN_TURN_POINTS:
+        return 0.0
+    bearing = np.sort(np.arctan2(points[:, 1], points[:, 0]))
+    gaps = np.diff(bearing, append=bearing[0] + 2.0 * np.pi)
+    if gaps.max() > _MAX_TURN_GAP_RAD:
+        return 0.0
+    return float(np.clip(np.median(gaps), *_TURN_SPACING_RAD))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

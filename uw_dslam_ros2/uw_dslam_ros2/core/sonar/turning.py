@@ -26,7 +26,15 @@ from uw_dslam_ros2.core.sonar.detect import (
 )
 from uw_dslam_ros2.core.sonar.types import Detections, SonarImage
 
-__all__ = ["BeamGatherer", "Beams", "PlacedSweep", "Slice", "Sweep", "place_sweep"]
+__all__ = [
+    "BeamGatherer",
+    "Beams",
+    "PlacedSweep",
+    "Slice",
+    "Sweep",
+    "beams_of_image",
+    "place_sweep",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -77,6 +85,14 @@ class Beams:
                 )
         if self.range_m.shape != expected:
             raise InvalidInputError(f"range_m has shape {self.range_m.shape}, expected {expected}")
+
+
+def beams_of_image(image: SonarImage) -> Beams:
+    """The few beams of an image, all of its time."""
+    stamp_ns = np.full(len(image.bearing_rad), image.stamp_ns, np.int64)
+    bearing = np.asarray(image.bearing_rad, np.float64)
+    range_m = np.asarray(image.range_m, np.float64)
+    return Beams(stamp_ns, bearing, range_m, float(range_m[-1]), image.intensity)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,9 +161,22 @@ class Sweep:
             found.beam,
             found.range_m * scale[found.beam],
             found.weight,
-            found.free_range_m * scale,
+            _free_range(found) * scale,
             found.range_sigma_m,
         )
+
+
+def _free_range(echoes: BeamEchoes) -> FloatArray:
+    """Free ranges (B,): a beam without echo is as free as the beam beside it that has one.
+
+    A wall between two beams that see it is there although it answers badly just so: a wide beam
+    that turns misses more of a wall at a slant than a fan does.
+    """
+    nearest_m = np.full(len(echoes.free_range_m), np.inf)
+    np.minimum.at(nearest_m, echoes.beam, echoes.range_m)
+    beside_m = np.minimum(np.append(nearest_m[1:], np.inf), np.insert(nearest_m[:-1], 0, np.inf))
+    is_silent = np.isinf(nearest_m)
+    return np.where(is_silent, np.minimum(echoes.free_range_m, beside_m), echoes.free_range_m)
 
 
 class BeamGatherer:
