@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 
-__all__ = ["WORDS", "Finding", "Severity"]
+__all__ = ["SEVERITIES", "WORDS", "Finding", "Severity"]
 
 Severity = Literal["info", "warning", "error"]
-_SEVERITIES = ("info", "warning", "error")
+SEVERITIES = ("info", "warning", "error")
 
 WORDS = {"velocity": "dvl"}
 """What a role is called in text, where that is not the role's own name."""
@@ -41,9 +41,9 @@ class Finding:
     def __post_init__(self) -> None:
         if not 0.0 <= self.confidence <= 1.0:
             raise InvalidInputError(f"confidence is {self.confidence}, expected 0 to 1")
-        if self.severity not in _SEVERITIES:
+        if self.severity not in SEVERITIES:
             raise InvalidInputError(
-                f"severity is {self.severity!r}, expected one of {', '.join(_SEVERITIES)}"
+                f"severity is {self.severity!r}, expected one of {', '.join(SEVERITIES)}"
             )
 
     @property

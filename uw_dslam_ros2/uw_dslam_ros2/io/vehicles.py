@@ -10,7 +10,7 @@ from pathlib import Path
 from uw_dslam_ros2.core.errors import ConfigError, DataError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io.recordings import open_bag
-from uw_dslam_ros2.io.sensor_settings import SensorConfig
+from uw_dslam_ros2.io.sensor_settings import SENSOR_ROLES, SensorConfig
 from uw_dslam_ros2.io.topics import VehicleTopics, find_vehicles, roles_of_type
 
 __all__ = ["VehicleRecording", "find_recordings", "recordings_of"]
@@ -54,11 +54,16 @@ class _Bag:
     def of(cls, path: Path) -> _Bag:
         with open_bag(path) as reader:
             counts = {t: n for t, n in reader.message_counts.items() if n}
+            # Mountings are latched: a recording begins with those of long ago.
+            sensors = [
+                t for t in counts if set(roles_of_type(reader.topics[t])) & set(SENSOR_ROLES)
+            ]
+            first = next(iter(reader.raw(sensors)), None) if sensors else None
             return cls(
                 path,
                 {topic: reader.topics[topic] for topic in counts},
                 counts,
-                reader.start_ns,
+                reader.start_ns if first is None else first.stamp_ns,
                 reader.end_ns,
                 reader.damage,
             )

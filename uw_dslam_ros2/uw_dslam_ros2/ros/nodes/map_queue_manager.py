@@ -369,8 +369,9 @@ class MapQueueManager(Node):
         values = {**self._values, **dict(sorted(self._counts.items()))}
         values["num_jobs_waiting"] = self._worker.num_waiting
         num_servers = self._values.get("num_servers", 0)
-        is_well = num_servers != 0
-        return is_well, self._message if is_well else "no registration server on the graph", values
+        if not num_servers:
+            return "warning", "no registration server on the graph", values
+        return "info", self._message, values
 
 
 def _unanswered(reason: str) -> RegistrationResult:

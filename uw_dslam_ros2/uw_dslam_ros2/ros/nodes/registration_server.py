@@ -257,7 +257,7 @@ class RegistrationServer(Node):
         }
         is_full = counts.num_running + counts.num_waiting >= self._jobs.max_accepted
         text = f"{counts.num_running} running, {counts.num_waiting} waiting"
-        return not is_full, text, values
+        return "warning" if is_full else "info", text, values
 
 
 def adapted[ConfigT: Config](config: ConfigT, max_seconds: float, **given: float) -> ConfigT:

@@ -5,21 +5,24 @@ from __future__ import annotations
 import functools
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
-from uw_dslam_ros2.core.errors import ConfigError, InvalidInputError
+from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
+from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.io import messages
+from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed
 from uw_dslam_ros2.io.readings import (
     BeamsEvent,
@@ -47,7 +50,7 @@ from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
 from uw_dslam_ros2.ros.plumbing.running import run_node
-from uw_dslam_ros2.ros.plumbing.sensor_inputs import sensor_inputs
+from uw_dslam_ros2.ros.plumbing.sensor_inputs import SensorInput, default_inputs, found_inputs
 from uw_dslam_ros2.ros.plumbing.stamp_order import StampOrder
 from uw_dslam_ros2.ros.plumbing.throttle import Throttle
 from uw_dslam_ros2.ros.plumbing.worker import Worker
@@ -61,6 +64,8 @@ _MAX_AHEAD_NS = 10_000_000_000
 _MOUNT_PATIENCE_NS = 5_000_000_000
 _ODOM_PERIOD_NS = 100_000_000
 _FINISH_TIMEOUT_S = 600.0
+_SILENT_S, _LOST_S = 5.0, 30.0  # a sensor's silence that is a warning, and an error
+_USUAL_PERIODS = 5.0
 _IDLE_S = 4.0  # longer than the repair of a lost message takes
 
 
@@ -85,7 +90,7 @@ class SonarMapper(Node):
         )
         self._counts: Counter[str] = Counter()
         self._mapper_values: dict[str, float | int | str] = {}
-        self._last_problem = ""
+        self._last_problem = self._problem = ""
         self._odom_stamp_ns = 0
         self._map_stamp_ns = 0
         self._drawing = Throttle(self._config.map_period_s)
@@ -95,15 +100,19 @@ class SonarMapper(Node):
         self._create_publishers()
         group = MutuallyExclusiveCallbackGroup()
         self._mounts = Mounts(self, lambda: self._worker.post(self._drain), callback_group=group)
-        self._expected_types: dict[str, str] = {}
-        self._streams: list[str] = []
-        self._create_subscriptions(group)
+        self._group = group
+        self._inputs: dict[str, SensorInput] = {}
+        self._subscriptions_of: dict[str, Subscription] = {}
+        self._heard: dict[str, _Heard] = {}
+        for sensor in default_inputs(self._config, self._vehicle_id, self._on_finding):
+            self._subscribe(sensor)
         self.create_service(
             Trigger, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup()
         )
         self._diagnostics = Diagnostics(self, self._report, self._vehicle_id)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._on_idle_timer, clock=steady, callback_group=group)
+        self.create_timer(1.0, self._on_discovery_timer, clock=steady, callback_group=group)
         self.get_logger().info(
             f"mapping {self._vehicle_id} from {self._config.input}, body frame {self._base_frame}"
         )
@@ -129,38 +138,82 @@ class SonarMapper(Node):
         self._odom_pub = self.create_publisher(Odometry, "odom", DEFAULT)
         self._broadcaster = FrameBroadcaster(self)
 
-    def _create_subscriptions(self, group: Any) -> None:
-        for sensor in sensor_inputs(self._config, self._vehicle_id):
-            take = functools.partial(self._on_message, sensor.topic, sensor.to_event)
-            qos = sensor_qos(sensor.queue_depth, is_reliable=self._config.is_reliable)
-            subscribe_batched(self, sensor.msg_type, sensor.topic, take, qos, group)
-            self._streams.append(sensor.topic)
-            full_name = self.resolve_topic_name(sensor.topic)
-            package = sensor.msg_type.__module__.split(".")[0]
-            self._expected_types[full_name] = f"{package}/msg/{sensor.msg_type.__name__}"
+    def _subscribe(self, sensor: SensorInput) -> None:
+        """Listen to a topic, and no more to the one that had its role before."""
+        msg_type = sensor.msg_type
+        if old := self._subscriptions_of.pop(sensor.role, None):
+            self.destroy_subscription(old)
+        self._inputs[sensor.role] = sensor
+        qos = sensor_qos(sensor.queue_depth, is_reliable=self._config.is_reliable)
+        take = functools.partial(self._on_message, sensor)
+        self._subscriptions_of[sensor.role] = subscribe_batched(
+            self, msg_type, sensor.topic, take, qos, self._group
+        )
+
+    def _on_discovery_timer(self) -> None:
+        """Find sensors whose topics have other names or types than the usual ones."""
+        own = {self.resolve_topic_name(name) for name in ("odom", "map", "path", "submap")}
+        namespace = self.get_namespace().strip("/")
+        wanted = self._config.topics.chosen().values()
+        table = {}
+        for topic, _ in self.get_topic_names_and_types():
+            is_mine = not namespace or topic.startswith(f"/{namespace}/") or topic in wanted
+            senders = self.get_publishers_info_by_topic(topic) if is_mine else []
+            if senders and topic not in own:
+                table[topic] = senders[0].topic_type
+        try:
+            found = found_inputs(
+                self._config, self._vehicle_id, namespace, table, self._on_finding
+            )
+            for sensor in found:
+                if not self._is_sent(self._inputs.get(sensor.role)):
+                    self._subscribe(sensor)
+                    self.get_logger().info(f"{sensor.name} is {sensor.topic} ({sensor.msgtype})")
+        except DataError as error:
+            # A topic that is set may still come.
+            is_waiting = "no topic" in str(error)
+            self._problem = self._problem if is_waiting else str(error)
+
+    def _is_sent(self, sensor: SensorInput | None) -> bool:
+        """Whether somebody sends what is listened to."""
+        if sensor is None:
+            return False
+        senders = self.get_publishers_info_by_topic(self.resolve_topic_name(sensor.topic))
+        return any(info.topic_type == sensor.msgtype for info in senders)
+
+    def _on_finding(self, finding: Finding) -> None:
+        if finding.severity != "info":
+            self._problem = finding.sentence
+            self.get_logger().warning(finding.sentence, throttle_duration_sec=WARNING_PERIOD_S)
 
     # --- messages to events ------------------------------------------------------------------
 
-    def _on_message(
-        self, topic: str, convert: Callable[[Any], SensorEvent | None], msg: Any
-    ) -> None:
-        self._counts[f"num_{topic}"] += 1
+    def _on_message(self, sensor: SensorInput, msg: Any) -> None:
+        name = sensor.name
+        self._counts[f"num_{name}"] += 1
         self._heard_s = time.monotonic()
+        self._heard.setdefault(name, _Heard(self._heard_s)).hear(self._heard_s)
+        now_ns = self.get_clock().now().nanoseconds
         try:
             self._check_stamp(msg)
-            event = convert(msg)
+            events = sensor.to_events(msg, now_ns)
         except InvalidInputError as error:
-            self._complain(f"bad message on {topic}: {error}")
+            self._complain(f"bad message on {name}: {error}")
             return
         except (ValueError, TypeError, OverflowError) as error:
-            self._complain(f"bad message on {topic}: {type(error).__name__}: {error}")
+            self._complain(f"bad message on {name}: {type(error).__name__}: {error}")
             return
-        if event is None:
-            self._counts["num_no_velocity"] += 1
-        self._worker.post(functools.partial(self._take, topic, messages.stamp_of(msg), event))
+        stamp_ns = stamp_of(msg) or now_ns
+        if not events:
+            self._counts["num_no_velocity"] += sensor.role == "velocity"
+            self._worker.post(functools.partial(self._take, name, stamp_ns, None))
+        for event in events:
+            self._worker.post(functools.partial(self._take, name, event.stamp_ns, event))
 
     def _check_stamp(self, msg: Any) -> None:
-        stamp_ns = messages.stamp_of(msg)
+        if not hasattr(msg, "header"):
+            return
+        stamp_ns = stamp_of(msg)
         if stamp_ns <= 0:
             raise InvalidInputError(
                 f"header.stamp is {stamp_ns * 1e-9} s, expected the time of the measurement"
@@ -202,9 +255,9 @@ class SonarMapper(Node):
 
     def _expect_streams(self, stamp_ns: int) -> None:
         """At the start, wait for the first message of every sensor that somebody sends."""
-        for topic in self._streams:
-            if self.count_publishers(topic):
-                self._order.expect(topic, stamp_ns - 1)  # its own may be of the same moment
+        for sensor in list(self._inputs.values()):
+            if self.count_publishers(sensor.topic):
+                self._order.expect(sensor.name, stamp_ns - 1)  # its own may be of the same moment
 
     def _restart(self) -> None:
         self._order.clear()
@@ -330,11 +383,12 @@ class SonarMapper(Node):
         return response
 
     def _report(self) -> Report:
-        for topic, expected in self._expected_types.items():
+        for sensor in list(self._inputs.values()):
+            topic = self.resolve_topic_name(sensor.topic)
             for info in self.get_publishers_info_by_topic(topic):
-                if info.topic_type != expected:
+                if info.topic_type != sensor.msgtype:
                     self._complain(
-                        f"topic {topic} has type {info.topic_type}, expected {expected}"
+                        f"topic {topic} has type {info.topic_type}, expected {sensor.msgtype}"
                     )
         values = {
             **dict(sorted(self._counts.items())),
@@ -344,9 +398,43 @@ class SonarMapper(Node):
             **self._mapper_values,
         }
         num_pings = self._mapper_values.get("num_pings", 0)
+        problem = self._last_problem or self._problem
+        severity, silence = self._silence()
         if not num_pings:
-            return False, self._last_problem or "no ping mapped yet", values
-        return True, self._last_problem or f"{num_pings} pings mapped", values
+            text = problem or "no ping mapped yet"
+            return max(severity, "warning", key=SEVERITIES.index), silence or text, values
+        return severity, silence or problem or f"{num_pings} pings mapped", values
+
+    def _silence(self) -> tuple[Severity, str]:
+        """How bad it is that sensors which were heard are heard no more, and which."""
+        if self._is_finished:
+            return "info", ""
+        now_s = time.monotonic()
+        ages = {name: heard.silence_s(now_s) for name, heard in list(self._heard.items())}
+        silent = {name: age_s for name, age_s in ages.items() if age_s > _SILENT_S}
+        if not silent:
+            return "info", ""
+        text = "; ".join(f"{name}: no message for {age_s:.0f} s" for name, age_s in silent.items())
+        return "error" if max(silent.values()) > _LOST_S else "warning", text
+
+
+@dataclass(slots=True)
+class _Heard:
+    """When a sensor was heard, by a steady clock."""
+
+    first_s: float
+    last_s: float = 0.0
+    num: int = 0
+
+    def hear(self, now_s: float) -> None:
+        self.last_s = now_s
+        self.num += 1
+
+    def silence_s(self, now_s: float) -> float:
+        """Time since the last message; 0 as long as that is usual for this sensor."""
+        period_s = (self.last_s - self.first_s) / max(1, self.num - 1)
+        age_s = now_s - self.last_s
+        return age_s if age_s > _USUAL_PERIODS * period_s else 0.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

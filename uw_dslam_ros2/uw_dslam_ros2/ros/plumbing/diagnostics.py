@@ -8,12 +8,18 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from uw_dslam_ros2.core.findings import Severity
 from uw_dslam_ros2.ros.plumbing.qos import DEFAULT
 
 __all__ = ["Diagnostics"]
 
-Report = tuple[bool, str, Mapping[str, float | int | str]]
-"""Whether all is well, a sentence, and the values."""
+Report = tuple[Severity, str, Mapping[str, float | int | str]]
+"""How bad it is ("info": all is well), a sentence, and the values."""
+_LEVELS = {
+    "info": DiagnosticStatus.OK,
+    "warning": DiagnosticStatus.WARN,
+    "error": DiagnosticStatus.ERROR,
+}
 
 
 class Diagnostics:
@@ -35,9 +41,9 @@ class Diagnostics:
 
     def publish(self) -> None:
         """Send one status now."""
-        is_well, text, values = self._make_report()
+        severity, text, values = self._make_report()
         status = DiagnosticStatus(
-            level=DiagnosticStatus.OK if is_well else DiagnosticStatus.WARN,
+            level=_LEVELS[severity],
             name=f"{self._node.get_fully_qualified_name().lstrip('/')}: {self._node.get_name()}",
             message=text,
             hardware_id=self._hardware_id,

@@ -2,105 +2,127 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from geometry_msgs.msg import TwistWithCovarianceStamped
-from marine_acoustic_msgs.msg import Dvl, ProjectedSonarImage
-from sensor_msgs.msg import FluidPressure, Imu, LaserScan, PointCloud2
-
-from uw_dslam_ros2.io import messages
-from uw_dslam_ros2.io.drivers.laser_scan import read_scan
-from uw_dslam_ros2.io.drivers.settings import ReadSettings
+from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.io.drivers import ADAPTERS, stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent
-from uw_dslam_ros2.io.readings import (
-    DepthEvent,
-    ImageEvent,
-    ImuEvent,
-    PointsEvent,
-    VelocityEvent,
-)
+from uw_dslam_ros2.io.topics import topics_of
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 
-__all__ = ["SensorInput", "sensor_inputs"]
+__all__ = ["SensorInput", "default_inputs", "found_inputs"]
 
 _PING_QUEUE = 100
 """Pings kept while the mapper is busy: ten seconds at 10 Hz, and an image is large."""
 _SENSOR_QUEUE = 5000
 """Other messages kept meanwhile: half a minute of a fast IMU; nearly nothing in memory."""
 
+_NAMES = {"velocity": "dvl"}
+_SONARS = {
+    "scan": ("scan", "sensor_msgs/msg/LaserScan"),
+    "points": ("points", "sensor_msgs/msg/PointCloud2"),
+}
+_IMAGE = ("sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+
 
 @dataclass(frozen=True, slots=True)
 class SensorInput:
-    """One topic; ``to_event`` gives None for a message without a value (no bottom lock)."""
+    """One topic, by its role; ``name`` is what it is called in diagnostics.
 
-    msg_type: Any
+    ``to_events`` takes a message and the time of now [ns], which those without a header get; it
+    gives nothing for a message without a value (no bottom lock).
+    """
+
+    role: str
+    name: str
     topic: str
-    to_event: Callable[[Any], SensorEvent | None]
-    queue_depth: int
+    msgtype: str
+    to_events: Callable[[Any, int], Sequence[SensorEvent]]
+
+    @property
+    def queue_depth(self) -> int:
+        """Messages kept while the mapper is busy."""
+        return _PING_QUEUE if self.role == "sonar" else _SENSOR_QUEUE
+
+    @property
+    def msg_type(self) -> Any:
+        """Class of the messages; `DataError` where their package is not installed."""
+        package, _, name = self.msgtype.split("/")
+        try:
+            return getattr(importlib.import_module(f"{package}.msg"), name)
+        except (ImportError, AttributeError) as error:
+            raise DataError(
+                f"topic {self.topic} has type {self.msgtype}, whose package {package} is not "
+                "installed"
+            ) from error
 
 
-def sensor_inputs(config: SonarMapperConfig, vehicle_id: str) -> tuple[SensorInput, ...]:
-    """Pings, velocity, heading and depth, as the settings name them."""
-    reader = _Reader(config, vehicle_id)
-    ping_type, ping_topic, to_event = {
-        "any": (ProjectedSonarImage, "sonar", reader.image),
-        "image": (ProjectedSonarImage, "sonar", reader.image),
-        "scan": (LaserScan, "scan", reader.scan),
-        "points": (PointCloud2, "points", reader.points),
-    }[config.input]
-    velocity_type = Dvl if config.velocity != "twist" else TwistWithCovarianceStamped
-    return (
-        SensorInput(
-            ping_type,
-            ping_topic,
-            to_event,
-            # A scan may hold a single beam.
-            _SENSOR_QUEUE if ping_type is LaserScan else _PING_QUEUE,
+def default_inputs(
+    config: SonarMapperConfig, vehicle_id: str, tell: Callable[[Finding], None]
+) -> tuple[SensorInput, ...]:
+    """Pings, velocity, heading and depth under their usual names, where none are set.
+
+    They are subscribed to before anybody sends, so that nothing of a replay is missed.
+    """
+    velocity = "geometry_msgs/msg/TwistWithCovarianceStamped"
+    usual = {
+        "sonar": _SONARS.get(config.input, _IMAGE),
+        "velocity": (
+            "dvl",
+            velocity if config.velocity == "twist" else "marine_acoustic_msgs/msg/Dvl",
         ),
-        SensorInput(velocity_type, "dvl", reader.velocity, _SENSOR_QUEUE),
-        SensorInput(Imu, "imu", reader.imu, _SENSOR_QUEUE),
-        SensorInput(FluidPressure, "depth", reader.depth, _SENSOR_QUEUE),
+        "imu": ("imu", "sensor_msgs/msg/Imu"),
+        "depth": ("depth", "sensor_msgs/msg/FluidPressure"),
+    }
+    return tuple(
+        _input(config, vehicle_id, tell, role, name, name, msgtype)
+        for role, (name, msgtype) in usual.items()
+        if role not in config.topics.chosen()
     )
 
 
-class _Reader:
-    """Makes events of messages."""
+def found_inputs(
+    config: SonarMapperConfig,
+    vehicle_id: str,
+    namespace: str,
+    table: Mapping[str, str],
+    tell: Callable[[Finding], None],
+) -> tuple[SensorInput, ...]:
+    """What plays which role among topics (name -> type) that somebody sends now.
 
-    def __init__(self, config: SonarMapperConfig, vehicle_id: str) -> None:
-        self._config = config
-        self._vehicle_id = vehicle_id
+    Raises
+    ------
+    DataError
+        If two could equally well play a role; it says what to write.
+    """
+    topics = topics_of(table, vehicle_id, namespace, config, is_alone=False)[0]
+    return tuple(
+        _input(config, vehicle_id, tell, role, _NAMES.get(role, role), topic, table[topic])
+        for role, topic in topics.items()
+        if role != "truth"
+    )
 
-    def _key(self, msg: Any) -> tuple[str, int, str]:
-        return self._vehicle_id, messages.stamp_of(msg), msg.header.frame_id
 
-    def image(self, msg: Any) -> SensorEvent:
-        """A sonar image."""
-        image = messages.sonar_image_of(msg, self._config.data_order)
-        return ImageEvent(*self._key(msg), image)
+def _input(
+    config: SonarMapperConfig,
+    vehicle_id: str,
+    tell: Callable[[Finding], None],
+    role: str,
+    name: str,
+    topic: str,
+    msgtype: str,
+) -> SensorInput:
+    settings = config.read_settings(vehicle_id, role, tell)
 
-    def scan(self, msg: Any) -> SensorEvent | None:
-        """Ranges over angles: of one moment, or beams with times of their own."""
-        return next(iter(read_scan(msg, ReadSettings(vehicle_id=self._vehicle_id))), None)
+    def to_events(msg: Any, now_ns: int) -> Sequence[SensorEvent]:
+        found = ADAPTERS[msgtype].read(msg, settings)
+        if stamp_of(msg) or hasattr(msg, "header"):
+            return found
+        return [dataclasses.replace(event, stamp_ns=now_ns) for event in found]
 
-    def points(self, msg: Any) -> SensorEvent:
-        """Echoes that somebody else found."""
-        return PointsEvent(*self._key(msg), messages.points_of_cloud(msg))
-
-    def imu(self, msg: Any) -> SensorEvent:
-        """Yaw and yaw rate."""
-        return ImuEvent(*self._key(msg), *messages.readings_of_imu(msg))
-
-    def depth(self, msg: Any) -> SensorEvent:
-        """Pressure as depth."""
-        depth_m = messages.depth_of_pressure(msg, self._config.water_density_kg_m3)
-        return DepthEvent(*self._key(msg), depth_m)
-
-    def velocity(self, msg: Any) -> SensorEvent | None:
-        """Velocity over ground; None without bottom lock."""
-        is_dvl = self._config.velocity != "twist"
-        value = messages.velocity_of_dvl(msg) if is_dvl else messages.velocity_of_twist(msg)
-        if value is None:
-            return None
-        return VelocityEvent(*self._key(msg), *value, is_z_down=is_dvl)
+    return SensorInput(role, name, topic, msgtype, to_events)

@@ -1,0 +1,107 @@
+"""Clocks that are zero, jump or disagree, on made-up streams."""
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.clocks import StreamTimes, corrected_clocks, find_gaps
+
+SECOND = 1_000_000_000
+START = 1_700_000_000 * SECOND
+
+
+def times(rate_hz, seconds=120.0, delay_s=0.05, seed=0):
+    """True times and times of recording [ns], with a delay that varies a little."""
+    true = START + (np.arange(int(seconds * rate_hz)) / rate_hz * SECOND).astype(np.int64)
+    jitter = np.random.default_rng(seed).uniform(0.0, 0.02, len(true))
+    return true, true + ((delay_s + jitter) * SECOND).astype(np.int64)
+
+
+def vehicle(**stamps_of):
+    """Streams with true stamps, or what a function makes of them, and the truth."""
+    streams, truth = {}, {}
+    for seed, (role, rate_hz) in enumerate((("sonar", 3.0), ("imu", 25.0), ("velocity", 6.0))):
+        true, recorded = times(rate_hz, seed=seed)
+        streams[role] = StreamTimes(stamps_of.get(role, lambda t: t)(true.copy()), recorded)
+        truth[role] = true
+    return streams, truth
+
+
+def worst_s(stamps, truth):
+    return max(float(np.abs(stamps[role] - truth[role]).max()) * 1e-9 for role in truth)
+
+
+def test_good_clocks_are_left_alone():
+    streams, truth = vehicle()
+    stamps, findings = corrected_clocks(streams)
+    assert worst_s(stamps, truth) == 0.0
+    assert findings == []
+
+
+def test_a_vehicle_whose_whole_clock_is_wrong_is_right_in_itself():
+    wrong = {role: lambda t: t - 3600 * SECOND for role in ("sonar", "imu", "velocity")}
+    streams, _ = vehicle(**wrong)
+    stamps, findings = corrected_clocks(streams)
+    assert findings == []
+    assert all((stamps[role] == streams[role].stamp_ns).all() for role in streams)
+
+
+@pytest.mark.parametrize("hours", [-24.0, -1.0, 1.0])
+def test_one_sensor_with_another_clock_is_brought_to_the_others(hours):
+    streams, truth = vehicle(sonar=lambda t: t + int(hours * 3600) * SECOND)
+    stamps, (finding,) = corrected_clocks(streams)
+    assert worst_s(stamps, truth) < 0.05
+    assert (finding.kind, finding.role) == ("clock_offset", "sonar")
+    assert ("ahead of" if hours > 0 else "behind") in finding.detail
+
+
+def test_a_sensor_that_is_only_slow_is_left_alone():
+    streams, truth = vehicle()
+    sonar = StreamTimes(streams["sonar"].stamp_ns, streams["sonar"].recorded_ns + 3 * SECOND)
+    stamps, findings = corrected_clocks({**streams, "sonar": sonar})
+    assert (stamps["sonar"] == truth["sonar"]).all()
+    assert findings == []
+
+
+@pytest.mark.parametrize("jump_s", [-40.0, -2.0, 3600.0])
+def test_a_clock_that_is_set_in_mid_mission_is_set_back(jump_s):
+    def jumped(stamps):
+        return stamps + np.where(stamps > START + 60 * SECOND, int(jump_s), 0) * SECOND
+
+    streams, truth = vehicle(sonar=jumped, imu=jumped, velocity=jumped)
+    stamps, (finding,) = corrected_clocks(streams)
+    assert worst_s(stamps, truth) < 0.05
+    assert (finding.kind, finding.role) == ("clock_jump", "")
+    assert f"{abs(jump_s):.1f} s" in finding.detail
+    # All sensors by the same: what lies between them stays as it was.
+    late = truth["imu"] > START + 61 * SECOND
+    moved = {int(d) for d in np.unique((stamps["imu"] - streams["imu"].stamp_ns)[late])}
+    assert len(moved) == 1
+
+
+def test_one_late_message_is_no_jump():
+    def with_a_late_one(stamps):
+        stamps[500] -= 5 * SECOND
+        return stamps
+
+    streams, truth = vehicle(imu=with_a_late_one)
+    stamps, findings = corrected_clocks(streams)
+    assert findings == []
+    assert (np.delete(stamps["imu"], 500) == np.delete(truth["imu"], 500)).all()
+
+
+def test_a_sensor_without_stamps_gets_the_times_of_recording():
+    streams, truth = vehicle(sonar=np.zeros_like)
+    stamps, (finding,) = corrected_clocks(streams)
+    assert worst_s(stamps, truth) < 0.05
+    assert (finding.kind, finding.role) == ("zero_stamps", "sonar")
+
+
+def test_gaps_are_found_inside_and_at_the_ends():
+    _, truth = vehicle()
+    seconds = (truth["imu"] - START) // SECOND
+    assert find_gaps(truth) == []
+    silent = truth | {"imu": truth["imu"][(seconds < 40) | (seconds >= 70)]}
+    (gap,) = find_gaps(silent)
+    assert (gap.role, round(gap.seconds)) == ("imu", 30)
+    (gap,) = find_gaps(truth | {"velocity": truth["velocity"][:-120]})
+    assert (gap.role, round(gap.seconds)) == ("velocity", 20)
