@@ -46,8 +46,9 @@ class SensorInput:
 
     @property
     def queue_depth(self) -> int:
-        """Messages kept while the mapper is busy."""
-        return _PING_QUEUE if self.role == "sonar" else _SENSOR_QUEUE
+        """Messages kept while the mapper is busy; a scan or an echo may be a single beam."""
+        is_small = self.role != "sonar" or self.msgtype.endswith(("/LaserScan", "/SonarEcho"))
+        return _SENSOR_QUEUE if is_small else _PING_QUEUE
 
     @property
     def msg_type(self) -> Any:
