@@ -4,8 +4,9 @@
 
     ros2 launch uw_dslam_ros2 vehicles.launch.py bags:="mission/auv_1 mission/auv_2" rate:=5.0
 
-Each bag is one vehicle's, named after the bag's folder unless `vehicles` says otherwise. Without
-bags, `n` live vehicles auv_1, auv_2, ... are mapped.
+The vehicles in the bags and their topics are found as `offline` finds them, unless `vehicles`
+names one for each bag. Without bags, `n` live vehicles auv_1, auv_2, ... are mapped, and each
+finds its sensors below its namespace.
 """
 
 from pathlib import Path
@@ -19,11 +20,13 @@ from launch.actions import (
 from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
+from launch.logging import get_logger
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
+from uw_dslam_ros2.io.vehicles import find_recordings
 
 PACKAGE = "uw_dslam_ros2"
 
@@ -31,6 +34,16 @@ PACKAGE = "uw_dslam_ros2"
 def text_of(context, name):
     """Value of a launch argument."""
     return LaunchConfiguration(name).perform(context).strip()
+
+
+def recordings_of(context, bags):
+    """Recordings by the vehicle's name, where nobody names the vehicles."""
+    if text_of(context, "vehicles") or not bags or not all(Path(bag).exists() for bag in bags):
+        return {}
+    recordings, findings = find_recordings(bags)
+    for finding in findings:
+        get_logger("vehicles").warning(finding.sentence)
+    return {recording.vehicle_id: recording for recording in recordings}
 
 
 def vehicles_of(context, bags):
@@ -49,13 +62,23 @@ def vehicles_of(context, bags):
     return names
 
 
+def topic_parameters(recording):
+    """What a mapper must be told of topics that it would not find below its namespace."""
+    if recording is None or recording.namespace == recording.vehicle_id:
+        return []
+    topics = {f"topics.{r}": t for r, t in recording.topics.items() if r != "truth"}
+    tail = recording.namespace.split("/")[-1]
+    return [topics | ({"base_frame": f"{tail}/base_link"} if tail else {})]
+
+
 def make_nodes(context):
     """All nodes, by the arguments."""
     bags = [str(Path(bag).expanduser().resolve()) for bag in text_of(context, "bags").split()]
     n = text_of(context, "n")
     bags = bags[: int(n)] if n else bags
     is_replay = bool(bags)
-    names = vehicles_of(context, bags)
+    recordings = recordings_of(context, bags)
+    names = list(recordings) or vehicles_of(context, bags)
     clock = {"use_sim_time": is_replay}
     config = LaunchConfiguration("config_dir").perform(context)
     replay_settings = [f"{config}/replay.yaml"] if is_replay else []
@@ -72,6 +95,7 @@ def make_nodes(context):
                     if text_of(context, "mapper_config")
                     else []
                 ),
+                *topic_parameters(recordings.get(name)),
                 clock,
             ],
             output="screen",
@@ -122,7 +146,12 @@ def make_nodes(context):
                 "start_s": float(text_of(context, "start")),
                 "duration_s": float(text_of(context, "duration")),
                 "max_lag_s": 10.0,
-                "wait_for": [f"/{name}/imu" for name in names],
+                "wait_for": [
+                    recordings[name].topics.get("imu", f"/{name}/imu")
+                    if name in recordings
+                    else f"/{name}/imu"
+                    for name in names
+                ],
             }
         ],
         output="screen",
