@@ -60,7 +60,7 @@ _TRUTH = "truth"
 def read_events(
     paths: str | Path | Sequence[str | Path],
     vehicle_id: str | None = None,
-    data_order: str = "range_major",
+    data_order: str = "auto",
     *,
     topics: TopicsConfig | None = None,
     water_density_kg_m3: float = 1025.0,
@@ -73,7 +73,7 @@ def read_events(
     ----------
     paths : bags, as `open_bag` takes them.
     vehicle_id : whose they are; None takes it from the topics' namespace (``/auv_1/sonar``).
-    data_order : layout of sonar images, one of `messages.DATA_ORDERS`.
+    data_order : layout of sonar images, "auto", "range_major" or "beam_major".
     topics : topics that are set; the others are found by their types.
     water_density_kg_m3 : turns pressure into depth; fresh water has 1000.
 

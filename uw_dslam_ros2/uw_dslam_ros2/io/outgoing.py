@@ -1,4 +1,4 @@
-"""Core values to messages for bags; `messages` is the way back."""
+"""Core values to messages for bags; `drivers` is the way back."""
 
 from __future__ import annotations
 

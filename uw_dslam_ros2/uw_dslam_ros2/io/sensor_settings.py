@@ -85,9 +85,9 @@ class SensorConfig(Config):
         is_basic=True,
     )
     data_order: str = setting(
-        "range_major",
+        "auto",
         choices=DATA_ORDERS,
-        doc="slowest index of a sonar image's bytes",
+        doc="slowest index of a sonar image's bytes; auto: found by the first images",
         is_basic=True,
     )
     velocity: str = setting(
@@ -123,7 +123,7 @@ class SensorConfig(Config):
         "first", choices=CHOICES["scan_stamp"], doc="ray that a LaserScan's stamp belongs to"
     )
     point_max_height_m: float = setting(
-        1.0, 0.0, 1000.0, "points further above or below their frame's plane are left out [m]"
+        1.0, 0.0, 1000.0, "points further above or below the sonar are left out [m]"
     )
     pressure: str = setting(
         "auto", choices=CHOICES["pressure"], doc="what a pressure is measured against"

@@ -1,6 +1,6 @@
 """Messages to core types and back: geometry, maps, submaps.
 
-`io.messages` reads the instruments, `registration` what a registration asks and answers.
+`io.drivers` reads the instruments, `registration` what a registration asks and answers.
 
 Our ``OccupancyGrid`` carries -1 for unknown and 0 (free) to 100 (occupied) percent. A rotated
 origin is honoured; an origin that is not a rotation about z is refused. rclpy does not check field
