@@ -96,6 +96,31 @@ def test_a_sensor_without_stamps_gets_the_times_of_recording():
     assert (finding.kind, finding.role) == ("zero_stamps", "sonar")
 
 
+def test_the_first_stamps_may_be_zero():
+    def zero_at_first(stamps):
+        stamps[:8] = 0
+        return stamps
+
+    streams, truth = vehicle(sonar=zero_at_first)
+    stamps, findings = corrected_clocks(streams)
+    assert findings == []
+    assert (stamps["sonar"][:8] == 0).all()
+    assert (stamps["sonar"][8:] == truth["sonar"][8:]).all()
+
+
+def test_times_of_a_converter_say_nothing_of_clocks():
+    """All is written within seconds, and the mission has a pause."""
+    streams, truth = vehicle()
+    for role in streams:
+        is_kept = (truth[role] < START + 40 * SECOND) | (truth[role] > START + 70 * SECOND)
+        stamp_ns = truth[role][is_kept]
+        written_ns = START + 10**6 * np.arange(len(stamp_ns), dtype=np.int64)
+        streams[role] = StreamTimes(stamp_ns, written_ns)
+    stamps, findings = corrected_clocks(streams)
+    assert findings == []
+    assert all((stamps[role] == streams[role].stamp_ns).all() for role in streams)
+
+
 def test_gaps_are_found_inside_and_at_the_ends():
     _, truth = vehicle()
     seconds = (truth["imu"] - START) // SECOND

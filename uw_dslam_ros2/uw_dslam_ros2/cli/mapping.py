@@ -178,7 +178,8 @@ def map_recording(
         newest |= {submap.sequence: submap for submap in mapper.finish()}
     _count(number % 200)
     stamps_ns, poses = mapper.trajectory()
-    sensor_stamps = {role: stamps for role, stamps in reader.stamps.items() if len(stamps)}
+    sensor_stamps = {r: stamps[stamps > 0] for r, stamps in reader.stamps.items()}
+    sensor_stamps = {role: stamps for role, stamps in sensor_stamps.items() if len(stamps)}
     vehicle = MappedVehicle(
         recording.vehicle_id,
         {

@@ -105,7 +105,7 @@ def _run(args: argparse.Namespace) -> int:
     findings += [finding for made in mapped for finding in made.findings]
     unmapped = [made.vehicle_id for made in mapped if not made.submaps]
     if len(unmapped) == len(mapped):
-        raise NothingMappedError("; ".join(f.sentence for f in findings))
+        raise NothingMappedError("; ".join(f.sentence for f in findings if f.severity == "error"))
 
     queue = MapQueue(config.queue)
     for made in mapped:

@@ -19,6 +19,8 @@ _JUMP_BACK_S = 1.0
 """Stamps of one sensor never go back by more, unless its clock is set."""
 _JUMP_AHEAD_S = 5.0
 _SAME_JUMP_S = 0.5
+_MAX_DRIFT = 0.2
+"""Share by which times of recording that were taken live may go slower or faster than stamps."""
 _NEIGHBOURS = 5
 """A jump lasts: a single message that came late is none."""
 _DISAGREE_S = 30.0
@@ -64,10 +66,20 @@ def corrected_clocks(
     without = {role for role, times in streams.items() if _are_zero(times.stamp_ns)}
     stamps = {r: t.stamp_ns.copy() for r, t in streams.items()}
     findings: list[Finding] = []
-    if len(without) < len(streams):
-        _mend_jumps({r: t for r, t in streams.items() if r not in without}, stamps, findings)
-        _mend_offsets({r: t for r, t in streams.items() if r not in without}, stamps, findings)
-    delays = [_delay_ns(streams[r], stamps[r]) for r in streams if r not in without]
+    # A stamp of zero among others is a bad message, and says nothing of the clock.
+    is_set = {role: times.stamp_ns > 0 for role, times in streams.items()}
+    judged = {
+        role: StreamTimes(times.stamp_ns[is_set[role]], times.recorded_ns[is_set[role]])
+        for role, times in streams.items()
+        if role not in without
+    }
+    mended = {role: times.stamp_ns.copy() for role, times in judged.items()}
+    if judged:
+        _mend_jumps(judged, mended, findings)
+        _mend_offsets(judged, mended, findings)
+    for role, stamp_ns in mended.items():
+        stamps[role][is_set[role]] = stamp_ns
+    delays = [_delay_ns(times, mended[role]) for role, times in judged.items()]
     for role in sorted(without):
         stamps[role] = streams[role].recorded_ns - (int(np.median(delays)) if delays else 0)
         findings.append(
@@ -132,6 +144,10 @@ def _jumps(times: StreamTimes) -> list[tuple[int, int]]:
     is_back = (step_ns < -_JUMP_BACK_S * _SECOND_NS) & (excess_ns < -_JUMP_BACK_S * _SECOND_NS)
     is_ahead = excess_ns > _JUMP_AHEAD_S * _SECOND_NS
     ahead_ns = stamp_ns - recorded_ns
+    others_ns = excess_ns[~(is_back | is_ahead)]
+    span_ns = int(recorded_ns[-1] - recorded_ns[0])
+    if abs(int(others_ns.sum())) > _MAX_DRIFT * span_ns:
+        return []  # written at another pace than it was measured, by a converter
     jumps = []
     for index in np.flatnonzero(is_back | is_ahead) + 1:
         before = ahead_ns[max(0, index - _NEIGHBOURS) : index]
@@ -155,7 +171,9 @@ def _mend_offsets(
     )
     for role in order:
         behind_s = (delays[role] - delays[reference]) * 1e-9
-        if -_AHEAD_S <= behind_s <= _DISAGREE_S:
+        own_ns = streams[role].recorded_ns - stamps[role]
+        is_steady = float(np.median(np.abs(own_ns - delays[role]))) * 1e-9 < _SAME_JUMP_S
+        if -_AHEAD_S <= behind_s <= _DISAGREE_S or not is_steady:
             continue
         stamps[role] += delays[role] - delays[reference]
         way = "behind" if behind_s > 0.0 else "ahead of"

@@ -192,11 +192,18 @@ class VehicleReader:
                     for topic, msgtype in reader.topics.items()
                     if roles_of_type(msgtype) == ("tf_static",)
                     and topic.endswith("tf_static") is is_latched
+                    and self._is_mine(topic)
                 ]
                 for number, raw in enumerate(reader.raw(topics) if topics else ()):
                     if number >= _MAX_MOUNTINGS and not is_latched:
                         break
                     yield from _transforms_of(reader.deserialize(raw), self._recording.vehicle_id)
+
+    def _is_mine(self, topic: str) -> bool:
+        """Whether a topic of transforms is everybody's, or below the vehicle's namespace."""
+        namespace = topic.strip("/").rpartition("/")[0]
+        own = self._recording.namespace
+        return not namespace or not own or f"{own}/".startswith(f"{namespace}/")
 
     def events(self) -> Iterator[Event]:
         """Everything but transforms, in order of recording."""
