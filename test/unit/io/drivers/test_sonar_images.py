@@ -60,6 +60,23 @@ def test_projected_image_with_x_forward_has_y_to_port():
     target_at(30.0, 3.0, event)
 
 
+def test_ranges_may_fall():
+    msg = projected(X_FORWARD, one_target((4, 2), 1, 0))
+    msg.ranges = msg.ranges[::-1]
+    (event,) = read("marine_acoustic_msgs/msg/ProjectedSonarImage", msg)
+    assert (np.diff(event.image.range_m) > 0.0).all()
+    target_at(30.0, 3.0, event)
+
+
+def test_pixels_that_are_no_number_hold_nothing():
+    pixels = one_target((4, 2), 2, 0, np.float32)
+    pixels[0] = np.nan
+    msg = projected(X_FORWARD, pixels, dtype=8)
+    (event,) = read("marine_acoustic_msgs/msg/ProjectedSonarImage", msg)
+    target_at(30.0, 3.0, event)
+    assert event.image.intensity[0].tolist() == [0.0, 0.0]
+
+
 def test_decibels_of_the_simulator_become_amplitudes():
     decibels = np.full((4, 2), -60.0, np.float32)
     decibels[2, 0] = -20.0
@@ -82,7 +99,7 @@ def test_a_projected_image_says_what_is_wrong():
     with pytest.raises(InvalidInputError, match=r"image\.data has 8 bytes, expected 6"):
         read(name, Msg(**{**vars(msg), "ranges": msg.ranges[:3]}))
     with pytest.raises(InvalidInputError, match="not finite and rising"):
-        read(name, Msg(**{**vars(msg), "ranges": msg.ranges[::-1]}))
+        read(name, Msg(**{**vars(msg), "ranges": msg.ranges[[0, 2, 1, 3]]}))
     with pytest.raises(InvalidInputError, match=r"image\.dtype is 11"):
         read(name, projected(Z_FORWARD, one_target((4, 2), 2, 0), dtype=11))
     with pytest.raises(InvalidInputError, match="without a bearing"):

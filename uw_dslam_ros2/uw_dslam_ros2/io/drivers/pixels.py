@@ -72,6 +72,8 @@ def amplitudes(pixels: Pixels, settings: ReadSettings) -> Pixels:
             peak = max(float(amplitude.max()), settings.memory.get("peak", 0.0))
             settings.memory["peak"] = peak
             return np.asarray(amplitude / peak, np.float32)
+        if np.isnan(values).any():
+            return np.where(np.isnan(values), 0.0, pixels)  # nothing was measured there
     return pixels
 
 

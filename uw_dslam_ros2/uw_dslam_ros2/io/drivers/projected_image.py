@@ -39,8 +39,9 @@ def read_projected(msg: Any, settings: ReadSettings) -> Sequence[ImageEvent]:
         )
     if num_beams == 0 and num_ranges == 0:
         return ()  # what a sonar sends that has not begun to ping
-    if not (np.isfinite(range_m).all() and (np.diff(range_m) > 0.0).all()):
-        raise InvalidInputError("ranges are not finite and rising")
+    steps = np.diff(range_m)
+    if not (np.isfinite(range_m).all() and ((steps > 0.0).all() or (steps < 0.0).all())):
+        raise InvalidInputError("ranges are not finite and rising (or falling)")
     bearing_rad, forward = _bearings(directions)
     return (_image_event(msg, settings, range_m, bearing_rad, forward),)
 
@@ -98,6 +99,8 @@ def _image_event(
     pixels = pixels_of(msg.image.data, dtype, shape, "image.data")
     if _order_of(pixels, settings) == "beam_major":
         pixels = pixels.reshape(shape[::-1]).T
+    if range_m[0] > range_m[-1]:
+        range_m, pixels = range_m[::-1], pixels[::-1]
     image = SonarImage(stamp_of(msg), amplitudes(pixels, settings), range_m, bearing_rad)
     return ImageEvent(*key_of(msg, settings), image, forward)
 
