@@ -107,8 +107,9 @@ def test_a_projected_image_says_what_is_wrong():
 
 
 def test_a_sonar_that_has_not_begun_holds_nothing():
-    empty = projected([], np.empty((0, 0), np.uint8))
-    assert read("marine_acoustic_msgs/msg/ProjectedSonarImage", empty) == ()
+    for directions, shape in (([], (0, 0)), ([], (4, 0)), (Z_FORWARD, (0, 2))):
+        empty = projected(directions, np.empty(shape, np.uint8))
+        assert read("marine_acoustic_msgs/msg/ProjectedSonarImage", empty) == ()
 
 
 @pytest.mark.parametrize("dtype", ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "f4", "f8"])
@@ -150,7 +151,8 @@ def test_raw_image_of_a_gemini():
         read(name, raw(sample_rate=0.0), by_beam)
     with pytest.raises(InvalidInputError, match="rx_angles has 1 entries"):
         read(name, raw(rx_angles=[0.0]), by_beam)
-    assert read(name, raw(rx_angles=[], samples_per_beam=0), by_beam) == ()
+    assert read(name, raw(samples_per_beam=0), by_beam) == ()
+    assert read(name, raw(rx_angles=[], image=image_data([], 0)), by_beam) == ()
 
 
 def ensta(rows, *, has_gains=False, size=1, before=b"", **changes):

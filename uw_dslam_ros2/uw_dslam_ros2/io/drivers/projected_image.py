@@ -37,8 +37,8 @@ def read_projected(msg: Any, settings: ReadSettings) -> Sequence[ImageEvent]:
         raise InvalidInputError(
             f"beam_directions has {len(directions)} entries, expected beam_count = {num_beams}"
         )
-    if num_beams == 0 and num_ranges == 0:
-        return ()  # what a sonar sends that has not begun to ping
+    if num_beams == 0 or num_ranges == 0:
+        return ()  # a sonar that has not begun to ping
     steps = np.diff(range_m)
     if not (np.isfinite(range_m).all() and ((steps > 0.0).all() or (steps < 0.0).all())):
         raise InvalidInputError("ranges are not finite and rising (or falling)")
@@ -67,13 +67,13 @@ def read_raw(msg: Any, settings: ReadSettings) -> Sequence[ImageEvent]:
     bearing_rad = -np.asarray(msg.rx_angles, dtype=np.float64)
     num_samples, rate_hz = int(msg.samples_per_beam), float(msg.sample_rate)
     sound_speed_m_s = float(msg.ping_info.sound_speed)
-    if len(bearing_rad) == 0 and num_samples == 0:
-        return ()
     if len(bearing_rad) != int(msg.image.beam_count):
         raise InvalidInputError(
             f"rx_angles has {len(bearing_rad)} entries, "
             f"expected beam_count = {int(msg.image.beam_count)}"
         )
+    if len(bearing_rad) == 0 or num_samples == 0:
+        return ()
     if not np.isfinite(bearing_rad).all():
         raise InvalidInputError("rx_angles holds values that are not finite")
     for name, value in (("sample_rate", rate_hz), ("ping_info.sound_speed", sound_speed_m_s)):
