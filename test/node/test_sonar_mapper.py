@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.parameter import Parameter
@@ -21,6 +21,7 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.messages import stamp_of
 from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, stamp_to_msg, submap_from_msg
+from uw_dslam_ros2.ros.nodes import sonar_mapper
 from uw_dslam_ros2.ros.nodes.sonar_mapper import SonarMapper
 from uw_dslam_ros2.ros.plumbing.qos import LATCHED, STATIC_TF, SUBMAPS
 
@@ -45,12 +46,13 @@ def scan_of_room(x_m):
 class Vehicle:
     """Sends what the sensors of a vehicle say that drives along the room, and hears the mapper."""
 
-    def __init__(self, context, vehicle_id="auv_1"):
+    def __init__(self, context, vehicle_id="auv_1", names=None):
+        names = names or {"scan": "scan", "imu": "imu", "dvl": "dvl"}
         self.id = vehicle_id
         self.node = node = rclpy.create_node("vehicle", context=context, namespace=vehicle_id)
-        self.scan_pub = node.create_publisher(LaserScan, "scan", 100)
-        self.imu_pub = node.create_publisher(Imu, "imu", 100)
-        self.twist_pub = node.create_publisher(TwistWithCovarianceStamped, "dvl", 100)
+        self.scan_pub = node.create_publisher(LaserScan, names["scan"], 100)
+        self.imu_pub = node.create_publisher(Imu, names["imu"], 100)
+        self.twist_pub = node.create_publisher(TwistWithCovarianceStamped, names["dvl"], 100)
         self.static_pub = node.create_publisher(TFMessage, "/tf_static", STATIC_TF)
         self.submaps, self.maps, self.odometry, self.paths = [], [], [], []
         self.frames, self.diagnostics = {}, []
@@ -244,6 +246,34 @@ def test_recording_that_begins_again_begins_a_new_map(ros_context, spinning):
         response = finish(until, vehicle)
     assert response.success
     assert vehicle.odometry[-1].pose.pose.position.x < 3 * SPEED_M_S
+
+
+def test_sensors_with_other_names_are_found_by_their_types(ros_context, spinning):
+    names = {"scan": "oculus/front", "imu": "xsens/data", "dvl": "nav/over_ground"}
+    vehicle = Vehicle(ros_context, names=names)
+    mapper = mapper_of(ros_context, input="any", velocity="any")
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        for second in range(3):
+            vehicle.send_second(second)
+        until(lambda: vehicle.values().get("num_sonar") == "6", "all scans")
+        until(lambda: vehicle.values().get("num_imu") == "30", "all of the IMU")
+        assert "6 pings mapped" in finish(until, vehicle).message
+
+
+def test_a_sensor_that_falls_silent_is_told(ros_context, spinning, monkeypatch):
+    monkeypatch.setattr(sonar_mapper, "_SILENT_S", 0.5)
+    monkeypatch.setattr(sonar_mapper, "_LOST_S", 4.0)
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        drive(until, vehicle, range(2))
+        until(lambda: "imu: no message for" in vehicle.message(), "the silence")
+        levels = {msg.status[0].level for msg in vehicle.diagnostics}
+        assert DiagnosticStatus.WARN in levels
+        until(lambda: vehicle.diagnostics[-1].status[0].level == DiagnosticStatus.ERROR, "lost")
 
 
 def test_wrong_type_on_a_topic_is_told(ros_context, ros_domain_id, spinning):
