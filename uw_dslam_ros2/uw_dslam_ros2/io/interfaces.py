@@ -9,6 +9,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.io.drivers.definitions import DEFINITIONS
 
 __all__ = ["interface_folders", "make_typestore"]
 
@@ -30,7 +31,7 @@ def interface_folders(package: str) -> list[Path]:
 
 
 def make_typestore() -> Typestore:
-    """All message types of ROS 2 Jazzy, and ours.
+    """All message types of ROS 2 Jazzy, ours, and some of drivers.
 
     Raises
     ------
@@ -41,6 +42,9 @@ def make_typestore() -> Typestore:
     for package in _PACKAGES:
         for path in _definitions(package):
             store.register(get_types_from_msg(path.read_text(), f"{package}/msg/{path.stem}"))
+    for name, text in DEFINITIONS.items():
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg(text, name))
     return store
 
 
