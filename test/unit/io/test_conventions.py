@@ -62,10 +62,9 @@ def test_what_is_not_filled_is_not_used():
     np.testing.assert_allclose(degrees.angular_velocity_rad_s, np.radians([0.1, 0.2, 0.3]))
 
 
-def test_velocities_are_scaled_mirrored_and_dropped():
-    conventions = Conventions(velocity_scale=0.01, velocity_is_mirrored=True)
-    result = correct(velocity(100.0, 50.0), conventions)
-    np.testing.assert_allclose(result.velocity_m_s, [1.0, -0.5, 0.0])
+def test_velocities_are_scaled_and_dropped():
+    result = correct(velocity(100.0, 50.0), Conventions(velocity_scale=0.01))
+    np.testing.assert_allclose(result.velocity_m_s, [1.0, 0.5, 0.0])
     np.testing.assert_allclose(np.diag(result.covariance), [1e-4, 2e-4, 3e-4])
     conventions = Conventions(velocity_zero_is_invalid=True)
     assert correct(velocity(0.0, 0.0, 0.0), conventions) is None
@@ -89,3 +88,6 @@ def test_mountings_turn_as_seen_from_above_whatever_the_instruments_axes():
         turned = correct_mounting(velocity(1.0, 0.0), mounting, conventions)
         np.testing.assert_allclose(turned[:3, :3] @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
     assert correct_mounting(image(), downward, conventions) is downward
+    mirrored = Conventions(velocity_is_mirrored=True, velocity_yaw_offset_rad=0.5 * math.pi)
+    turned = correct_mounting(velocity(1.0, 2.0), np.eye(4), mirrored)
+    np.testing.assert_allclose(turned[:3, :3] @ [1.0, 2.0, 0.0], [2.0, 1.0, 0.0], atol=1e-12)

@@ -25,7 +25,9 @@ from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfi
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.bags import ImuEvent, TransformEvent, TruthEvent
+from uw_dslam_ros2.io.conventions import correct_mounting
 from uw_dslam_ros2.io.events import VehicleReader
+from uw_dslam_ros2.io.examining import examine_recording, mended
 from uw_dslam_ros2.io.feeding import Mountings, feed, in_stamp_order, role_of
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
@@ -162,6 +164,9 @@ def map_recording(
     with VehicleReader(recording, sensors) as reader:
         findings = reader.check_clocks()
         mountings = _mountings(recording, sensors, reader.transforms())
+        examined = examine_recording(recording, sensors, config.sonar, reader.stamps, mountings.of)
+        reader.conventions, said = mended(examined, sensors.conventions)
+        findings += said
         for number, event in enumerate(in_stamp_order(reader.events()), start=1):
             if number % 200 == 0:
                 _count(200)
@@ -171,7 +176,8 @@ def map_recording(
                 has_yaw |= event.yaw_rad is not None
                 has_yaw_rate |= event.yaw_rate_rad_s is not None
             try:
-                submaps = feed(mapper, event, mountings.of(event))
+                mounting = correct_mounting(event, mountings.of(event), reader.conventions)
+                submaps = feed(mapper, event, mounting)
             except InvalidInputError as error:
                 raise DataError(f"{recording.vehicle_id}: {role_of(event)}: {error}") from error
             newest |= {submap.sequence: submap for submap in submaps}

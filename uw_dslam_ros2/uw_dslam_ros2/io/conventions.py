@@ -49,19 +49,22 @@ def correct(event: Event, conventions: Conventions) -> Event | None:
 def correct_mounting(
     event: Event, T_base_sensor: FloatArray, conventions: Conventions
 ) -> FloatArray:
-    """``T_base_sensor`` (4, 4) with the instrument turned as the conventions say."""
-    yaw_rad = 0.0
+    """``T_base_sensor`` (4, 4) with the instrument turned as the conventions say.
+
+    A mirrored velocity makes it a reflection: its forward and left become those of the body.
+    """
+    yaw_rad, side = 0.0, 1.0
     if isinstance(event, VelocityEvent):
         yaw_rad = conventions.velocity_yaw_offset_rad
+        side = -1.0 if conventions.velocity_is_mirrored else 1.0
     elif isinstance(event, _Ping):
         yaw_rad = conventions.sonar_yaw_offset_rad
-    if yaw_rad == 0.0:
+    if yaw_rad == 0.0 and side == 1.0:
         return T_base_sensor
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    turn = np.array([[cos, -sin * side, 0.0], [sin, cos * side, 0.0], [0.0, 0.0, 1.0]])
     turned = T_base_sensor.copy()
-    turned[:3, :3] = (
-        np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ (T_base_sensor[:3, :3])
-    )
+    turned[:3, :3] = turn @ T_base_sensor[:3, :3]
     return turned
 
 
@@ -108,14 +111,12 @@ def _product(a: tuple[float, ...] | FloatArray, b: tuple[float, ...]) -> FloatAr
 def _velocity(event: VelocityEvent, conventions: Conventions) -> VelocityEvent | None:
     if conventions.velocity_zero_is_invalid and not event.velocity_m_s[:2].any():
         return None
-    axes = np.array([1.0, -1.0 if conventions.velocity_is_mirrored else 1.0, 1.0])
-    factors = axes * conventions.velocity_scale
-    covariance = event.covariance
+    scale, covariance = conventions.velocity_scale, event.covariance
     return replace(
         event,
         stamp_ns=_earlier(event.stamp_ns, conventions.velocity_delay_s),
-        velocity_m_s=event.velocity_m_s * factors,
-        covariance=None if covariance is None else covariance * np.outer(factors, factors),
+        velocity_m_s=event.velocity_m_s * scale,
+        covariance=None if covariance is None else covariance * scale**2,
     )
 
 

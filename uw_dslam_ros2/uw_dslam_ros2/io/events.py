@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import heapq
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from uw_dslam_ros2.core.clocks import StreamTimes, corrected_clocks
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io import messages
+from uw_dslam_ros2.io.conventions import correct
 from uw_dslam_ros2.io.drivers import ADAPTERS, ReadSettings
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
@@ -143,6 +144,7 @@ class VehicleReader:
     ) -> None:
         self._recording = recording
         self._is_strict = is_strict
+        self.conventions = settings.conventions
         self._roles = {topic: role for role, topic in recording.topics.items()}
         self._readers: list[BagReader] = []
         self._stack = ExitStack()
@@ -205,8 +207,14 @@ class VehicleReader:
         own = self._recording.namespace
         return not namespace or not own or f"{own}/".startswith(f"{namespace}/")
 
-    def events(self) -> Iterator[Event]:
-        """Everything but transforms, in order of recording."""
+    def events(
+        self, is_wanted: Callable[[str, int | None], bool] | None = None
+    ) -> Iterator[Event]:
+        """Everything but transforms, in order of recording, in the usual conventions.
+
+        `is_wanted` is asked with the role and the stamp (None where clocks were not checked) of
+        each message before it is read.
+        """
         number = dict.fromkeys(self._recording.topics, 0)
         last: dict[str, bytes] = {}
         for index, raw in merged(self._readers, self._sensor_topics()):
@@ -220,6 +228,8 @@ class VehicleReader:
                 continue
             last[role] = raw.data
             stamp_ns = int(self.stamps[role][position]) if role in self.stamps else None
+            if is_wanted is not None and not is_wanted(role, stamp_ns):
+                continue
             try:
                 found = self._read(self._readers[index], raw, role, stamp_ns)
             except (InvalidInputError, DataError, ValueError, TypeError, OverflowError) as error:
@@ -229,8 +239,10 @@ class VehicleReader:
                 count.num_bad += 1
                 count.problem = count.problem or text
                 continue
-            count.num_empty += not found
-            yield from found
+            usual = [correct(event, self.conventions) for event in found]
+            kept = [event for event in usual if event is not None]
+            count.num_empty += not kept
+            yield from kept
 
     def _read(
         self, reader: BagReader, raw: RawMessage, role: str, stamp_ns: int | None

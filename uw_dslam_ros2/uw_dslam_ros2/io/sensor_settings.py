@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
 
 from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io.drivers import ReadSettings
@@ -129,6 +130,7 @@ class SensorConfig(Config):
         "auto", choices=CHOICES["pressure"], doc="what a pressure is measured against"
     )
     topics: TopicsConfig = TopicsConfig()
+    conventions: Conventions = setting(Conventions())
 
     def read_settings(
         self, vehicle_id: str, role: str, tell: Callable[[Finding], None]

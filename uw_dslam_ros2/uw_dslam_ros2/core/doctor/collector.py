@@ -80,6 +80,9 @@ class SampleCollector:
             self._velocity.append((stamp_ns, float(velocity[0]), float(velocity[1])))
             self._T_base_dvl = T_base_sensor
 
+    def add_attitude(self, *_: Any) -> None:
+        """Of the attitude only the yaw counts here, which `add_imu` has too."""
+
     def add_depth(self, stamp_ns: int, depth_m: float) -> None:
         """Depth says nothing of conventions in the plane."""
 
@@ -90,9 +93,11 @@ class SampleCollector:
         """Single beams do not show from ping to ping how the sonar moved."""
         return []
 
-    def add_image(self, image: SonarImage, T_base_sonar: SE2, *_: Any) -> list[Submap]:
+    def add_image(
+        self, image: SonarImage, T_base_sonar: SE2, projection: FloatArray | None = None
+    ) -> list[Submap]:
         """As a mapper's."""
-        return self._add(detect(image, self._sonar), T_base_sonar)
+        return self._add(detect(image, self._sonar), T_base_sonar, projection)
 
     def add_scan(
         self,
@@ -101,19 +106,28 @@ class SampleCollector:
         ranges_m: ArrayLike,
         range_max_m: float,
         T_base_sonar: SE2,
-        *_: Any,
+        projection: FloatArray | None = None,
     ) -> list[Submap]:
         """As a mapper's."""
         found = detections_from_scan(stamp_ns, angles_rad, ranges_m, range_max_m, self._sonar)
-        return self._add(found, T_base_sonar)
+        return self._add(found, T_base_sonar, projection)
 
     def add_points(
-        self, stamp_ns: int, points: ArrayLike, T_base_sonar: SE2, *_: Any
+        self,
+        stamp_ns: int,
+        points: ArrayLike,
+        T_base_sonar: SE2,
+        projection: FloatArray | None = None,
     ) -> list[Submap]:
         """As a mapper's."""
-        return self._add(detections_from_points(stamp_ns, points, self._sonar), T_base_sonar)
+        found = detections_from_points(stamp_ns, points, self._sonar)
+        return self._add(found, T_base_sonar, projection)
 
-    def _add(self, detections: Detections, T_base_sonar: SE2) -> list[Submap]:
+    def _add(
+        self, detections: Detections, T_base_sonar: SE2, projection: FloatArray | None
+    ) -> list[Submap]:
+        if projection is not None:
+            detections = detections.projected(projection)
         self._pings.append((detections.stamp_ns, detections.points))
         self._T_base_sonar = T_base_sonar
         return []
@@ -129,7 +143,6 @@ class SampleCollector:
             self._seconds([row[0] for row in velocity]),
             np.array([row[1:] for row in velocity]).reshape(-1, 2),
             (mount.x, mount.y),
-            mount.yaw,
         )
 
     def pings(self) -> PingSample:

@@ -24,7 +24,6 @@ from uw_dslam_ros2.core.doctor.imu import ImuState, compare_yaw_and_rate
 from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
 from uw_dslam_ros2.core.findings import Finding
-from uw_dslam_ros2.core.se2 import wrap_angle
 
 __all__ = ["Examination", "examine"]
 
@@ -32,6 +31,7 @@ FloatArray = NDArray[np.float64]
 
 _SURE = 0.99
 _MIN_MOTIONS = 15
+_MIN_READINGS = 20
 _MAX_TURN_COST = 1.5
 _MIN_DELAY_S = 0.08
 _MIN_OFFSET_RAD = math.radians(4.0)
@@ -53,10 +53,14 @@ class Examination:
     findings: list[Finding] = field(default_factory=list)
     conventions: Conventions = field(default_factory=Conventions)
     num_ping_motions: int = 0
+    mended: set[str] = field(default_factory=set)
+    """Kinds of findings that the conventions mend."""
 
     def add(self, finding: Finding, **changes: str | float | bool) -> None:
         """Name a cause, and what to change."""
         self.findings.append(finding)
+        if changes:
+            self.mended.add(finding.kind)
         self.conventions = Conventions(**(self.conventions.to_dict() | changes))
 
 
@@ -66,6 +70,8 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
     `pings` are bursts: each but the last of a burst has another about a second later.
     """
     result = Examination()
+    if len(navigation.imu_s) < _MIN_READINGS:
+        return result
     imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
     _judge_imu(result, imu, vehicle_id)
     navigation = _without_zeros(result, navigation, vehicle_id)
@@ -306,8 +312,7 @@ class _Trial:
         if fit is None:
             return
         if mirrored is not None and confidence_of(mirrored.cost, fit.cost) > _SURE:
-            # The instrument's own sideways axis is set right, before its mounting turns it.
-            offset = wrap_angle(mirrored.yaw_rad - 2.0 * self._navigation.velocity_mount_yaw_rad)
+            offset = mirrored.yaw_rad
             axes = "exchanged" if abs(abs(mirrored.yaw_rad) - 0.5 * math.pi) < 0.3 else "mirrored"
             self._add(
                 "dvl_mirrored",

@@ -21,8 +21,7 @@ class NavigationSample:
 
     ``imu_s`` (K,) rising, ``yaw_rad`` (K,) and ``yaw_rate_rad_s`` (K,), NaN where not said;
     ``velocity_s`` (V,) rising, ``velocity_m_s`` (V, 2) forward and left, measured at
-    ``velocity_lever_m`` (2,), by an instrument whose x axis points ``velocity_mount_yaw_rad`` to
-    port.
+    ``velocity_lever_m`` (2,).
     """
 
     imu_s: FloatArray
@@ -31,7 +30,6 @@ class NavigationSample:
     velocity_s: FloatArray
     velocity_m_s: FloatArray
     velocity_lever_m: tuple[float, float] = (0.0, 0.0)
-    velocity_mount_yaw_rad: float = 0.0
 
     def __post_init__(self) -> None:
         for name, times in (("imu_s", self.imu_s), ("velocity_s", self.velocity_s)):

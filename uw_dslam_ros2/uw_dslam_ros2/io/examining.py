@@ -1,0 +1,82 @@
+"""A vehicle's recording examined: a sample of its pings, and all of its navigation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.doctor import Examination, SampleCollector, examine
+from uw_dslam_ros2.core.doctor.bursts import choose_pings
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.core.sonar import SonarConfig
+from uw_dslam_ros2.io.conventions import correct_mounting
+from uw_dslam_ros2.io.events import VehicleReader
+from uw_dslam_ros2.io.feeding import feed
+from uw_dslam_ros2.io.readings import Reading, TransformEvent, TruthEvent
+from uw_dslam_ros2.io.sensor_settings import SensorConfig
+from uw_dslam_ros2.io.vehicles import VehicleRecording
+
+__all__ = ["examine_recording", "mended"]
+
+MountingOf = Callable[[Reading], NDArray[np.float64]]
+
+
+def examine_recording(
+    recording: VehicleRecording,
+    sensors: SensorConfig,
+    sonar: SonarConfig,
+    stamps: dict[str, NDArray[np.int64]],
+    mounting_of: MountingOf,
+) -> Examination:
+    """Try the conventions of a vehicle's sensors.
+
+    Parameters
+    ----------
+    stamps : role -> times (N,) [ns] of all its messages, as `VehicleReader.check_clocks` has them.
+    mounting_of : ``T_base_sensor`` (4, 4) of a reading.
+    """
+    collector = SampleCollector(sonar)
+    conventions = sensors.conventions
+
+    def collect(is_wanted: Callable[[str, int | None], bool]) -> None:
+        with VehicleReader(recording, sensors) as reader:
+            reader.stamps = stamps
+            for event in reader.events(is_wanted):
+                if isinstance(event, TruthEvent | TransformEvent):
+                    continue
+                try:
+                    mounting = correct_mounting(event, mounting_of(event), conventions)
+                    feed(collector, event, mounting)  # type: ignore[arg-type]  # has a mapper's inputs
+                except InvalidInputError:
+                    continue  # mapping says what is wrong with it
+
+    collect(lambda role, _: role in ("imu", "velocity"))
+    navigation = collector.navigation()
+    if "sonar" in stamps and len(navigation.imu_s):
+        ping_ns = np.unique(stamps["sonar"])
+        ping_s = np.asarray((ping_ns - collector.start_ns) * 1e-9, np.float64)
+        chosen = choose_pings(ping_s, navigation.imu_s, navigation.yaw_rate_rad_s)
+        wanted = {int(stamp_ns) for stamp_ns in ping_ns[chosen]}
+        collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in wanted)
+    return examine(collector.navigation(), collector.pings(), recording.vehicle_id)
+
+
+def mended(examined: Examination, known: Conventions) -> tuple[Conventions, list[Finding]]:
+    """Conventions to read a recording by, and what to tell of it.
+
+    What was found is used at once, where the settings say nothing of conventions.
+    """
+    if known != Conventions():
+        return known, list(examined.findings)
+    findings = [
+        replace(finding, detail=f"{finding.detail}; it is mapped so")
+        if finding.kind in examined.mended
+        else finding
+        for finding in examined.findings
+    ]
+    return examined.conventions, findings
