@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +33,19 @@ _Q_FRD_FLU = (1.0, 0.0, 0.0, 0.0)
 _Ping = ImageEvent | ScanEvent | PointsEvent | BeamsEvent
 
 
-def correct(event: Event, conventions: Conventions) -> Event | None:
+def correct[EventT: Event](event: EventT, conventions: Conventions) -> EventT | None:
     """What a reading says in the usual conventions; None where it says nothing then.
 
     All but the angles of mounting, which `correct_mounting` takes.
     """
+    result: Event | None = event
     if isinstance(event, ImuEvent):
-        return _imu(event, conventions)
-    if isinstance(event, VelocityEvent):
-        return _velocity(event, conventions)
-    if isinstance(event, _Ping):
-        return _ping(event, conventions)
-    return event
+        result = _imu(event, conventions)
+    elif isinstance(event, VelocityEvent):
+        result = _velocity(event, conventions)
+    elif isinstance(event, _Ping):
+        result = _ping(event, conventions)
+    return cast("EventT | None", result)
 
 
 def correct_mounting(

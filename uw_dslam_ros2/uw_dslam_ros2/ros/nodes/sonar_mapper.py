@@ -22,6 +22,7 @@ from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.io.conventions import correct, correct_mounting
 from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed
 from uw_dslam_ros2.io.readings import (
@@ -196,7 +197,7 @@ class SonarMapper(Node):
         now_ns = self.get_clock().now().nanoseconds
         try:
             self._check_stamp(msg)
-            events = sensor.to_events(msg, now_ns)
+            said = sensor.to_events(msg, now_ns)
         except InvalidInputError as error:
             self._complain(f"bad message on {name}: {error}")
             return
@@ -204,6 +205,8 @@ class SonarMapper(Node):
             self._complain(f"bad message on {name}: {type(error).__name__}: {error}")
             return
         stamp_ns = stamp_of(msg) or now_ns
+        usual = [correct(event, self._config.conventions) for event in said]
+        events = [event for event in usual if event is not None]
         if not events:
             self._counts["num_no_velocity"] += sensor.role == "velocity"
             self._worker.post(functools.partial(self._take, name, stamp_ns, None))
@@ -302,7 +305,8 @@ class SonarMapper(Node):
             )
             return
         try:
-            submaps = feed(self._mapper, event, T_base_sensor)
+            mounting = correct_mounting(event, T_base_sensor, self._config.conventions)
+            submaps = feed(self._mapper, event, mounting)
         except InvalidInputError as error:
             self._complain(f"{type(event).__name__} of {event.frame_id}: {error}")
             return
