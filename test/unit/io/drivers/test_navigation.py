@@ -331,10 +331,11 @@ def test_odometry_is_a_pose_with_a_velocity():
     assert event.T_frame_base.as_array() == pytest.approx([1.0, 2.0, 0.5])
     np.testing.assert_array_equal(event.covariance, np.diag([1, 2, 6]))
     assert event.velocity_m_s.tolist() == [1.0, 0.25, 0.0]
-    (event,) = read(ODOMETRY, odometry(diagonal=[0] * 6, velocity=(0, 0, 0)))
+    (event,) = read(ODOMETRY, odometry(diagonal=[0] * 6, velocity=(0, 0, 0), x=1.0))
     assert (event.covariance, event.velocity_m_s) == (None, None)
     assert read(ODOMETRY, odometry(x=NAN)) == ()
-    bad = odometry()
+    assert read(ODOMETRY, odometry()) == ()  # a pose that nobody filled in
+    bad = odometry(x=1.0)
     bad.pose.pose.orientation = quaternion(0, 0, 0, 0)
     with pytest.raises(InvalidInputError, match="quaternion"):
         read(ODOMETRY, bad)

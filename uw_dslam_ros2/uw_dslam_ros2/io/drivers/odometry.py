@@ -64,7 +64,15 @@ def _readings(
     values = None if covariance is None else np.asarray(covariance, np.float64).reshape(6, 6)
     if settings.role == "fix":
         return (FixEvent(*key, position[:2], _filled(values, np.ix_([0, 1], [0, 1]))),)
+    if _is_unset(pose, position):
+        return ()
     return (PoseEvent(*key, "", planar_pose(pose), _filled(values, _XY_YAW)),)
+
+
+def _is_unset(pose: Any, position: FloatArray) -> bool:
+    """Whether nobody filled a pose in: drivers of DVLs send odometry for its twist alone."""
+    q = pose.orientation
+    return not position.any() and not any((q.x, q.y, q.z)) and q.w in (0.0, 1.0)
 
 
 def _filled(values: FloatArray | None, block: tuple[NDArray[np.intp], ...]) -> FloatArray | None:
