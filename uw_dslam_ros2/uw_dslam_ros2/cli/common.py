@@ -26,6 +26,7 @@ __all__ = [
     "progress_bar",
     "run_command",
     "versions",
+    "warn",
 ]
 
 EXIT_NOTHING_MADE = 1
@@ -59,6 +60,11 @@ def run_command(name: str, command: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return _EXIT_INTERRUPTED
+
+
+def warn(sentence: str) -> None:
+    """Say on stderr what was probably not meant."""
+    print(f"warning: {sentence}", file=sys.stderr)
 
 
 class Progress(Protocol):

@@ -20,6 +20,7 @@ from uw_dslam_ros2.core.merging import (
     LoopError,
     MapProvenance,
     MapQueue,
+    MapQueueConfig,
     SubmapRecord,
     SubmapState,
 )
@@ -224,11 +225,13 @@ def outcome_of(queue: MapQueue) -> Outcome:
 
 def _alone(submaps: list[Submap]) -> tuple[OccupancyMap, Trajectory]:
     """One vehicle's map and trajectory without any other, in the frame of its first submap."""
-    queue = MapQueue()
+    largest = max(submap.grid.values.size for submap in submaps)  # a queue has taken them before
+    queue = MapQueue(MapQueueConfig(max_submap_cells=max(largest, 16_000_000)))
     for submap in submaps:
         queue.add_submap(submap)
     occupancy = queue.global_map()
-    assert occupancy is not None  # it holds at least the first submap
+    if occupancy is None:  # nothing is known
+        occupancy = submaps[0].grid
     stamps_poses = queue.trajectories().get(submaps[0].vehicle_id)
     if stamps_poses is None:
         stamps_poses = np.empty(0, np.int64), np.empty((0, 3))

@@ -84,7 +84,7 @@ def png_bytes(figure: Figure, dpi: int = 110) -> bytes:
     return buffer.getvalue()
 
 
-def before_after(outcome: Outcome, title: str) -> Figure:
+def before_after(outcome: Outcome, title: str, members: str = "vehicles") -> Figure:
     """Each vehicle's map by itself, and the one map of all, with ways and seams."""
     colors = vehicle_colors([v.vehicle_id for v in outcome.vehicles])
     own = [extent_m(vehicle.own_map) for vehicle in outcome.vehicles]
@@ -96,8 +96,10 @@ def before_after(outcome: Outcome, title: str) -> Figure:
         show_map(axes, vehicle.own_map)
         draw_way(axes, vehicle.own_trajectory, colors[vehicle.vehicle_id])
         scale_bar(axes)
-        set_title(axes, f"{vehicle.vehicle_id} alone", "" if vehicle.is_merged else "not merged")
-    _show_merged(figure.add_axes(layout.share(layout.large)), outcome, colors)
+        # One title: a second one would lie on it where the picture is small.
+        state = "alone" if vehicle.is_merged else "alone, not merged"
+        set_title(axes, f"{vehicle.vehicle_id} {state}")
+    _show_merged(figure.add_axes(layout.share(layout.large)), outcome, colors, members)
     figure.text(
         GAP / layout.width,
         1.0 - 0.22 / layout.height,
@@ -175,12 +177,12 @@ class _Layout:
         return cls(width + 2.0 * GAP, bottom + row + HEAD, tuple(boxes), large)
 
 
-def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str]) -> None:
+def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str], members: str) -> None:
     merged = [v for v in outcome.vehicles if v.is_merged]
     left = [v.vehicle_id for v in outcome.vehicles if not v.is_merged]
     set_title(
         axes,
-        f"one map: {len(merged)} of {len(outcome.vehicles)} vehicles",
+        f"one map: {len(merged)} of {len(outcome.vehicles)} {members}",
         f"not merged: {', '.join(left)}" if left else "",
     )
     if outcome.global_map is None:
@@ -196,12 +198,19 @@ def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str]) -> Non
         draw_seam(axes, record.submap.grid, record.T_component_submap, color, opacity)
     handles: list[Any] = []
     for vehicle in merged:
+        color = colors[vehicle.vehicle_id]
         if vehicle.trajectory is not None:
-            color = colors[vehicle.vehicle_id]
             draw_way(axes, vehicle.trajectory, color)
-            handles.append(Line2D([], [], color=color, lw=2, label=vehicle.vehicle_id))
+        handles.append(Line2D([], [], color=color, lw=2, label=vehicle.vehicle_id))
     handles += [
-        Line2D([], [], color="#555555", lw=1.2, ls=(0, (1, 1.5)), label="seam of a submap"),
+        Line2D(
+            [],
+            [],
+            color="#555555",
+            lw=1.2,
+            ls=(0, (1, 1.5)),
+            label="seam of a submap" if members == "vehicles" else "rim of a map",
+        ),
         *shade_handles(),
     ]
     scale_bar(axes)

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from uw_dslam_ros2.cli.common import parser_for, run_command
+from uw_dslam_ros2.cli.common import parser_for, run_command, warn
 from uw_dslam_ros2.cli.outcome import json_bytes
+from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration import (
     GridRegistrationConfig,
     PriorWindow,
@@ -59,6 +60,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("target", type=Path, metavar="B.yaml")
     parser.add_argument("--out", type=Path, metavar="PNG", help="picture of A laid on B")
     parser.add_argument(
+        "--merge",
+        type=Path,
+        metavar="DIR",
+        help="write the merged map in B's frame, picture and verdict, as the command merge does",
+    )
+    parser.add_argument(
         "--prior",
         type=float,
         nargs=3,
@@ -82,12 +89,14 @@ def _run(args: argparse.Namespace) -> int:
     config = SettingsFile(args.config).section(
         GridRegistrationConfig, "registration", "/registration_server"
     )
-    source, target = read_map(args.source), read_map(args.target)
+    source, target = read_map(args.source, warn), read_map(args.target, warn)
     result = register_grids(source, target, config, prior=prior, clock=time.monotonic)
     if args.json:
         sys.stdout.write(json_bytes(_plain(result)).decode())
     else:
         print("\n".join(_lines(result)))
+    if args.merge is not None:
+        _merge(args, source, target, result)
     if args.out is not None:
         # Drawing takes longer to import than many a search takes.
         from uw_dslam_ros2.cli.pictures import overlay, png_bytes
@@ -105,6 +114,28 @@ def _run(args: argparse.Namespace) -> int:
         if not args.json:
             print(f"picture: {args.out}")
     return EXIT_CODES[result.verdict]
+
+
+def _merge(
+    args: argparse.Namespace,
+    source: OccupancyMap,
+    target: OccupancyMap,
+    result: RegistrationResult,
+) -> None:
+    """Write what ``merge`` writes, with the answer that was told."""
+    from uw_dslam_ros2.cli.map_merging import MapFile, merge_maps, told
+    from uw_dslam_ros2.cli.mapping import OfflineConfig
+    from uw_dslam_ros2.cli.merge import names_of, write_merged
+
+    paths = [args.target, args.source]
+    occupancies = [target, source]
+    maps = [MapFile(*one) for one in zip(names_of(paths), paths, occupancies, strict=True)]
+    config = OfflineConfig.read(args.config, [])
+    settler = told(maps[1], maps[0], result, config.registration)
+    merged = merge_maps(maps, config, settler=settler)
+    write_merged(args.merge, merged, config)
+    if not args.json:
+        print(f"merged map in {args.merge}" if merged.joined else f"not merged, see {args.merge}")
 
 
 def _prior(args: argparse.Namespace) -> PriorWindow | None:
