@@ -156,7 +156,14 @@ def map_recording(
     config: VehicleMapperConfig,
     sensors: SensorConfig = SensorConfig(),  # noqa: B008 (frozen)
 ) -> VehicleSubmaps:
-    """Map one vehicle; `DataError` where its bags cannot be read or a mounting is not known."""
+    """Map one vehicle; `DataError` where its bags cannot be read or a mounting is not known.
+
+    A recording without a sonar, or without any heading, makes no map, and findings that say so.
+    """
+    if "sonar" not in recording.topics or not {"imu", "odometry"} & set(recording.topics):
+        present = {role: SensorCount(1) for role in recording.topics}
+        found = health_findings(MappedVehicle(recording.vehicle_id, present, {}))
+        return VehicleSubmaps(recording.vehicle_id, (), {}, tuple(found))
     mapper = VehicleMapper(config, recording.vehicle_id)
     newest: dict[int, Submap] = {}
     number = 0

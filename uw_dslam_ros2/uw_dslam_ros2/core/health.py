@@ -100,8 +100,8 @@ def _check_sensors(vehicle: MappedVehicle, tell: _Tell) -> None:
             tell(
                 "no_heading",
                 "imu",
-                "there is no imu and no odometry, and so no heading: the map's direction comes "
-                "from the sonar alone",
+                "there is no imu and no odometry, and so no heading, without which no honest map "
+                "can be made",
             )
         elif not has_heading:
             tell("no_heading", "imu", "its messages have neither orientation nor rates")
