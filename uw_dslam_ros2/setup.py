@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 
 NAME = "uw_dslam_ros2"
 NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
-COMMANDS = ("simulate", "offline", "merge", "register", "evaluate", "study", "convert")
+COMMANDS = ("simulate", "offline", "doctor", "merge", "register", "evaluate", "study", "convert")
 
 # The settings live at the top of the repository and are installed with the package built there.
 CONFIG = sorted(glob("../config/*.yaml")) if Path("../config").is_dir() else []

@@ -39,6 +39,7 @@ __all__ = [
     "VehicleSubmaps",
     "map_recording",
     "map_recordings",
+    "mountings_of",
     "sensor_config",
     "settle",
 ]
@@ -170,7 +171,7 @@ def map_recording(
     has_yaw = has_yaw_rate = False
     with VehicleReader(recording, sensors) as reader:
         findings = reader.check_clocks()
-        mountings = _mountings(recording, sensors, reader.transforms())
+        mountings = mountings_of(recording, sensors, reader.transforms())
         examined = examine_recording(recording, sensors, config.sonar, reader.stamps, mountings.of)
         reader.conventions, said = mended(examined, sensors.conventions)
         findings += said
@@ -226,7 +227,7 @@ def map_recording(
     )
 
 
-def _mountings(
+def mountings_of(
     recording: VehicleRecording, sensors: SensorConfig, transforms: Iterable[TransformEvent]
 ) -> Mountings:
     """Where a vehicle's instruments sit."""

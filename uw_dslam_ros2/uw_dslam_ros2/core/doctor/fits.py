@@ -225,8 +225,8 @@ def _solve(
 def confidence_of(better: FloatArray, worse: FloatArray) -> float:
     """How sure it is that the lower costs (M,) are no chance, 0.5 to 1.
 
-    A cost is a negative log-likelihood; neighbouring motions err together, so four count as one.
+    A cost is a negative log-likelihood; neighbouring motions err together, so two count as one.
     """
     both = np.isfinite(better) & np.isfinite(worse)
-    lead = float((worse[both] - better[both]).sum()) / 4.0
+    lead = float((worse[both] - better[both]).sum()) / 2.0
     return float(expit(lead))

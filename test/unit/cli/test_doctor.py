@@ -1,0 +1,70 @@
+"""``doctor`` names what is wrong with a recording, and writes settings by which it comes right."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.cli.doctor import main
+from uw_dslam_ros2.cli.mapping import sensor_config
+from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.io.outgoing import MessageFactory
+from uw_dslam_ros2.io.recordings import BagWriter
+from uw_dslam_ros2.io.settings import SettingsFile
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    """An IMU that turns but whose orientation is never filled, and a DVL without bottom lock."""
+    path = tmp_path_factory.mktemp("recordings") / "auv_1"
+    with BagWriter(path) as writer:
+        make = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
+        writer.add_topic("/auv_1/dvl", "geometry_msgs/msg/TwistWithCovarianceStamped")
+        for k in range(600):
+            stamp_ns = 1000 * SECOND + k * SECOND // 10
+            rate = 0.3 * math.sin(0.02 * k)
+            writer.write("/auv_1/imu", stamp_ns, make.imu(stamp_ns, "", 0.0, 0.0, rate, 1e-6))
+            types = writer.typestore.types
+            linear = types["geometry_msgs/msg/Vector3"](
+                x=0.0 if 200 < k < 300 else 0.8, y=0.0, z=0.0
+            )
+            twist = types["geometry_msgs/msg/Twist"](
+                linear=linear, angular=types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+            )
+            header = make.imu(stamp_ns, "", 0.0, 0.0, rate, 1e-6).header
+            message = types["geometry_msgs/msg/TwistWithCovarianceStamped"](
+                header=header,
+                twist=types["geometry_msgs/msg/TwistWithCovariance"](
+                    twist=twist, covariance=np.zeros(36)
+                ),
+            )
+            writer.write("/auv_1/dvl", stamp_ns, message)
+    return path
+
+
+def test_what_is_wrong_is_told_and_mended(bag, tmp_path, capsys):
+    assert main([str(bag), "--out", str(tmp_path / "first")]) == 0
+    report = json.loads((tmp_path / "first" / "doctor.json").read_text())
+    kinds = [finding["kind"] for finding in report["findings"]]
+    assert kinds == ["imu_no_orientation", "dvl_zero_without_lock", "cannot_tell"]
+    assert {stream["role"] for stream in report["vehicles"][0]["streams"]} == {"imu", "velocity"}
+    out = capsys.readouterr().out
+    assert "auv_1 imu: its orientation never changes" in out
+    page = (tmp_path / "first" / "doctor.html").read_text()
+    assert "imu_no_orientation" in page
+
+    settings = tmp_path / "first" / "settings.yaml"
+    conventions = sensor_config(SettingsFile(settings), "auv_1").conventions
+    assert conventions == Conventions(imu_orientation="none", velocity_zero_is_invalid=True)
+    assert main([str(bag), "--out", str(tmp_path / "second"), "--config", str(settings)]) == 0
+    report = json.loads((tmp_path / "second" / "doctor.json").read_text())
+    assert [finding["kind"] for finding in report["findings"]] == ["cannot_tell"]
+
+
+def test_a_bag_that_is_not_there_is_bad_input(tmp_path, capsys):
+    assert main([str(tmp_path / "nothing"), "--out", str(tmp_path / "out")]) == 2
+    assert "nothing" in capsys.readouterr().err

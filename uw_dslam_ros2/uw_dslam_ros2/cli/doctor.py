@@ -1,0 +1,221 @@
+"""``doctor BAG...``: what a recording holds, what is wrong with it, and settings that mend it."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.cli.common import parser_for, run_command
+from uw_dslam_ros2.cli.mapping import mountings_of, sensor_config
+from uw_dslam_ros2.cli.outcome import json_bytes
+from uw_dslam_ros2.core.clocks import find_gaps
+from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.findings import WORDS, Finding
+from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
+from uw_dslam_ros2.io.atomic import write_files
+from uw_dslam_ros2.io.events import VehicleReader
+from uw_dslam_ros2.io.examining import examine_recording
+from uw_dslam_ros2.io.sensor_settings import SensorConfig
+from uw_dslam_ros2.io.settings import SettingsFile
+from uw_dslam_ros2.io.vehicles import VehicleRecording, find_recordings
+
+__all__ = ["main"]
+
+_FEW_MOTIONS = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One sensor's messages, times in seconds from the vehicle's first message."""
+
+    role: str
+    topic: str
+    num_messages: int
+    rate_hz: float
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What one vehicle's recording is like."""
+
+    vehicle_id: str
+    streams: tuple[Stream, ...]
+    findings: tuple[Finding, ...]
+    conventions: Conventions
+    num_ping_motions: int
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Examine recordings; exit code 0 whatever is found, 2 for bad input."""
+    args = _parser().parse_args(argv)
+    return run_command("doctor", lambda: _run(args))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = parser_for(
+        "doctor",
+        "Say what recordings hold and what is wrong with them: topics, rates, gaps, clocks, and\n"
+        "which conventions their sensors follow, by trying them on the sonar's echoes.\n"
+        "Writes doctor.html, doctor.json, and settings.yaml for 'offline --config' and the nodes.",
+        "doctor recording/auv_1 recording/auv_2 --out checked",
+    )
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="recordings")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="settings by which to read (YAML)"
+    )
+    return parser
+
+
+def _run(args: argparse.Namespace) -> int:
+    file = SettingsFile(args.config)
+    recordings, findings = find_recordings(args.bags, lambda name: sensor_config(file, name))
+    diagnoses = []
+    for recording in recordings:
+        mapper = file.section(
+            VehicleMapperConfig, "mapper", f"/{recording.vehicle_id}/sonar_mapper"
+        )
+        sensors = sensor_config(file, recording.vehicle_id)
+        diagnoses.append(_diagnose(recording, sensors, mapper))
+    for diagnosis in diagnoses:
+        _print(diagnosis)
+        findings += diagnosis.findings
+    for finding in findings:
+        print(f"{finding.severity}: {finding.sentence}")
+    if not findings:
+        print("nothing is wrong, as far as can be told")
+    args.out.mkdir(parents=True, exist_ok=True)
+    settings = _settings(diagnoses)
+    write_files(
+        {
+            args.out / "settings.yaml": settings.encode(),
+            args.out / "doctor.html": _page(diagnoses, findings, settings),
+            args.out / "doctor.json": json_bytes(_report(diagnoses, findings)),
+        }
+    )
+    print(f"results in {args.out}; map with: offline ... --config {args.out}/settings.yaml")
+    return 0
+
+
+def _diagnose(
+    recording: VehicleRecording, sensors: SensorConfig, mapper: VehicleMapperConfig
+) -> Diagnosis:
+    with VehicleReader(recording, sensors) as reader:
+        findings = [
+            dataclasses.replace(finding, vehicle_id=recording.vehicle_id)
+            for finding in reader.check_clocks()
+        ]
+        mountings = mountings_of(recording, sensors, reader.transforms())
+        stamps = reader.stamps
+    examined = examine_recording(recording, sensors, mapper.sonar, stamps, mountings.of)
+    findings += examined.findings
+    findings += [
+        Finding(
+            "gap",
+            gap.role,
+            f"it is silent for {gap.seconds:.0f} s; check its cable, or cut the recording there",
+            vehicle_id=recording.vehicle_id,
+        )
+        for gap in find_gaps(stamps)
+    ]
+    if examined.num_ping_motions < _FEW_MOTIONS:
+        findings.append(
+            Finding(
+                "cannot_tell",
+                "sonar",
+                "too few pings show how it moved (a sonar that turns, few echoes or no imu), so "
+                "the conventions of imu, dvl and sonar cannot be told from each other",
+                severity="info",
+                vehicle_id=recording.vehicle_id,
+            )
+        )
+    return Diagnosis(
+        recording.vehicle_id,
+        _streams(recording, stamps),
+        tuple(findings),
+        examined.conventions,
+        examined.num_ping_motions,
+    )
+
+
+def _streams(
+    recording: VehicleRecording, stamps: dict[str, NDArray[np.int64]]
+) -> tuple[Stream, ...]:
+    known = {role: np.sort(s) for role, s in stamps.items() if len(s)}
+    start_ns = min((int(s[0]) for s in known.values()), default=0)
+    streams = []
+    for role, topic in recording.topics.items():
+        if role not in known:
+            continue
+        seconds = (known[role] - start_ns) * 1e-9
+        step_s = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+        rate_hz = 1.0 / step_s if step_s > 0.0 else 0.0
+        streams.append(
+            Stream(role, topic, len(seconds), rate_hz, float(seconds[0]), float(seconds[-1]))
+        )
+    return tuple(streams)
+
+
+def _print(diagnosis: Diagnosis) -> None:
+    print(f"{diagnosis.vehicle_id}:")
+    for s in diagnosis.streams:
+        print(
+            f"  {WORDS.get(s.role, s.role):9} {s.topic:30} {s.num_messages:7} messages, "
+            f"{s.rate_hz:.3g} Hz, {s.start_s:.1f} to {s.end_s:.1f} s"
+        )
+    print(f"  examined by {diagnosis.num_ping_motions} motions from ping to ping")
+
+
+def _settings(diagnoses: Sequence[Diagnosis]) -> str:
+    content: dict[str, Any] = {}
+    for diagnosis in diagnoses:
+        if changes := diagnosis.conventions.changes():
+            content[f"/{diagnosis.vehicle_id}/sonar_mapper"] = {
+                "ros__parameters": {"conventions": changes}
+            }
+    head = "# What mends this recording; nothing, if this is all.\n"
+    return head + (yaml.safe_dump(content, sort_keys=True) if content else "")
+
+
+def _report(diagnoses: Sequence[Diagnosis], findings: Sequence[Finding]) -> dict[str, Any]:
+    return {
+        "findings": [finding.to_dict() for finding in findings],
+        "vehicles": [
+            {
+                "vehicle_id": d.vehicle_id,
+                "streams": [dataclasses.asdict(stream) for stream in d.streams],
+                "conventions": d.conventions.to_dict(),
+                "num_ping_motions": d.num_ping_motions,
+            }
+            for d in diagnoses
+        ],
+    }
+
+
+def _page(diagnoses: Sequence[Diagnosis], findings: Sequence[Finding], settings: str) -> bytes:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("uw_dslam_ros2.cli"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    template = environment.get_template("doctor.html.j2")
+    page = template.render(diagnoses=diagnoses, findings=findings, settings=settings, words=WORDS)
+    return page.encode()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
