@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from uw_dslam_ros2.core.mapping.config import MatchConfig
 from uw_dslam_ros2.core.mapping.matcher import (
@@ -17,7 +18,7 @@ from uw_dslam_ros2.core.mapping.matcher import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["LocalMap", "joined"]
+__all__ = ["WIDE_BEAM_RAD", "LocalMap", "joined"]
 
 FloatArray = NDArray[np.float64]
 _COARSEST = 8.0
@@ -26,8 +27,9 @@ _MIN_POINTS = 20
 _MAX_POINTS = 300
 """Of more echoes an even choice is matched: more of the same walls add time, not accuracy."""
 
-_WIDE_BEAM_RAD = 0.021
+WIDE_BEAM_RAD = 0.021
 """Wider beams leave gaps between the echoes of a wall."""
+_NEAR_M = 1.0
 
 
 def joined(
@@ -38,7 +40,7 @@ def joined(
     Two turns hear a wall at places that lie further apart than the field is wide; between two
     beams that are neighbours on it the wall goes on. Beams two widths apart see it at 60 degrees.
     """
-    if len(points) < 2 or beamwidth_rad < _WIDE_BEAM_RAD:
+    if len(points) < 2 or beamwidth_rad < WIDE_BEAM_RAD:
         return points, weight
     steps = np.diff(points, axis=0)
     length_m = np.hypot(steps[:, 0], steps[:, 1])
@@ -75,6 +77,16 @@ class LocalMap:
         self._pings = deque((T_new_old.apply(p), w, at_m) for p, w, at_m in self._pings)
         if self._last is not None:
             self._last = T_new_old @ self._last
+
+    def is_near(self, points: FloatArray) -> bool:
+        """Whether most points (N, 2) in the submap's frame lie near known ones, roughly."""
+        if len(points) < _MIN_POINTS or not self._pings:
+            return False
+        known = np.vstack([p for p, _, _ in self._pings])
+        if len(known) < _MIN_POINTS:
+            return False
+        distance_m, _ = cKDTree(known).query(points, distance_upper_bound=_NEAR_M)
+        return bool(np.isfinite(distance_m).mean() > 0.5)
 
     def match(self, points: FloatArray, weight: FloatArray, prior: Prior) -> ScanMatch | None:
         """Match a ping's echoes (N, 2) in base_link; None where there is too little to match."""

@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.estimators import make_estimator
-from uw_dslam_ros2.core.mapping.local_map import LocalMap, joined
+from uw_dslam_ros2.core.mapping.local_map import WIDE_BEAM_RAD, LocalMap, joined
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.mosaic import Mosaic
@@ -417,14 +417,20 @@ class VehicleMapper:
         stamp_ns = detections.stamp_ns
         points = T_base_sonar.apply(detections.points)
         T_submap_base, covariance = self._navigation.relative_at(stamp_ns)
-        self._count("num_key_pings")
+        # A turn later the place may be another one: then there is nothing that should match.
+        is_comparable = detections.beamwidth_rad < WIDE_BEAM_RAD or self._local_map.is_near(
+            T_submap_base.apply(points)
+        )
+        if is_comparable:
+            self._count("num_key_pings")
         # A pose that is exactly known cannot be corrected; a millimetre keeps the algebra regular.
         prior = Prior(T_submap_base, covariance + np.diag([1e-6, 1e-6, 1e-8]))
         match = self._local_map.match(points, detections.weight, prior)
         if match is not None:
             self._counts["match_overlap_last"] = match.overlap
             if match.overlap >= _MIN_OVERLAP:
-                self._count("num_matches")
+                if is_comparable:
+                    self._count("num_matches")
                 self._navigation.add_fix(stamp_ns, match.T_target_source, match.information)
                 T_submap_base, _ = self._navigation.relative_at(stamp_ns)
         if len(points):
