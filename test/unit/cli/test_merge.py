@@ -281,3 +281,7 @@ def test_two_parts_of_a_place_are_merged_in_earnest(tmp_path, rng) -> None:
     assert register.main([*arguments, "--merge", str(tmp_path / "two")]) == 0
     again = json.loads((tmp_path / "two" / "merge.json").read_text())
     assert (again["joined"], again["frame"]) == (["right", "left"], "right")
+    T_right_left = SE2(*again["maps"][1]["T_group_map"])
+    distance_m, angle_rad = T_right_left.distance_to(expected.inverse())
+    assert distance_m < 0.05
+    assert math.degrees(angle_rad) < 0.3

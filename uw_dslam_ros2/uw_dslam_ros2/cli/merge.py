@@ -217,7 +217,7 @@ def _lines(result: MergedMaps) -> list[str]:
             f"joined: {names}: {spec.num_cols} x {spec.num_rows} cells of {spec.resolution_m:g} m "
             f"in the frame of {result.frame}"
         )
-        lines += [f"  {_place(p)}" for p in result.joined if p.name != result.frame]
+        lines += [f"  {_place(p)}, {p.reason}" for p in result.joined if p.name != result.frame]
     for loop in result.outcome.loops:
         names = " - ".join(name for name, _ in loop.submaps)
         degrees = math.degrees(loop.error_rad)
@@ -227,7 +227,7 @@ def _lines(result: MergedMaps) -> list[str]:
         groups.setdefault(placement.group, []).append(placement)
     for members in groups.values():
         lines.append(f"apart: {members[0].name}: {members[0].reason}")
-        lines += [f"  joined with it alone: {_place(p)}" for p in members[1:]]
+        lines += [f"  joined with it, but not with the others: {_place(p)}" for p in members[1:]]
     return lines
 
 
@@ -247,7 +247,7 @@ def _place(placement: Placement) -> str:
     motion = placement.T_group_map
     return (
         f"{placement.name}: x {motion.x:.3f} m, y {motion.y:.3f} m, "
-        f"yaw {math.degrees(motion.yaw):.2f} degrees, {placement.reason}"
+        f"yaw {math.degrees(motion.yaw):.2f} degrees"
     )
 
 

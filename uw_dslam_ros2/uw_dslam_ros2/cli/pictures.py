@@ -97,8 +97,8 @@ def before_after(outcome: Outcome, title: str, members: str = "vehicles") -> Fig
         draw_way(axes, vehicle.own_trajectory, colors[vehicle.vehicle_id])
         scale_bar(axes)
         # One title: a second one would lie on it where the picture is small.
-        state = "alone" if vehicle.is_merged else "alone, not merged"
-        set_title(axes, f"{vehicle.vehicle_id} {state}")
+        state = " alone" if vehicle.is_merged else ": not merged"
+        set_title(axes, f"{vehicle.vehicle_id}{state}")
     _show_merged(figure.add_axes(layout.share(layout.large)), outcome, colors, members)
     figure.text(
         GAP / layout.width,
