@@ -36,6 +36,8 @@ _MAX_TURN_COST = 1.5
 _MIN_DELAY_S = 0.08
 _MIN_OFFSET_RAD = math.radians(4.0)
 _MIN_SCALE_ERROR = 0.019
+_USUAL_SCALE_ERROR = 0.015
+"""A DVL and a speed of sound that are as good as data sheets say disagree by less."""
 _UNIT_SCALE = 1.3
 _UNITS = {
     "millimetres per second": 1e-3, "centimetres per second": 1e-2, "knots": 0.5144,
@@ -370,7 +372,7 @@ class _Trial:
     def _judge_scale(self, fit: VelocityFit) -> None:
         sigma = fit.factor_sigma
         error = abs(fit.scale - 1.0)
-        if error < max(_MIN_SCALE_ERROR, 3.0 * sigma):
+        if error < _MIN_SCALE_ERROR or error - 2.0 * sigma < _USUAL_SCALE_ERROR:
             return
         if not 1.0 / _UNIT_SCALE < fit.scale < _UNIT_SCALE:
             name, unit = min(_UNITS.items(), key=lambda item: abs(math.log(fit.scale / item[1])))
