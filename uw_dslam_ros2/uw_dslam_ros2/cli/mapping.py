@@ -46,6 +46,7 @@ __all__ = [
 
 # One number, whatever the machine: which registrations are asked next depends on the answers.
 _BATCH = 4
+_YAW_WAIT_S = 1.0  # as long as the navigation filter waits for a heading
 
 Counter = Callable[[int, int], None]
 
@@ -169,6 +170,7 @@ def map_recording(
     newest: dict[int, Submap] = {}
     number = 0
     has_yaw = has_yaw_rate = False
+    first_ns: int | None = None
     with VehicleReader(recording, sensors) as reader:
         findings = reader.check_clocks()
         mountings = mountings_of(recording, sensors, reader.transforms())
@@ -180,7 +182,11 @@ def map_recording(
                 _count(200)
             if isinstance(event, TruthEvent | TransformEvent):
                 continue
+            first_ns = event.stamp_ns if first_ns is None else first_ns
             if isinstance(event, ImuEvent):
+                late_s = (event.stamp_ns - first_ns) * 1e-9
+                if not has_yaw and event.yaw_rad is not None and late_s > _YAW_WAIT_S:
+                    findings.append(_late_heading(late_s))
                 has_yaw |= event.yaw_rad is not None
                 has_yaw_rate |= event.yaw_rate_rad_s is not None
             try:
@@ -264,6 +270,15 @@ def _mounting_findings(mountings: Mountings, vehicle_id: str) -> list[Finding]:
         for frame_id, tilt_rad in sorted(mountings.tilted.items())
     ]
     return unknown + tilted
+
+
+def _late_heading(late_s: float) -> Finding:
+    return Finding(
+        "late_heading",
+        "imu",
+        f"its first orientation comes {late_s:.1f} s after the recording begins, so that the map "
+        "begins with a heading that is guessed; cut that part off, or wait for the imu",
+    )
 
 
 def settle(
