@@ -297,3 +297,26 @@ def test_same_input_same_bytes():
         results.append(navigation.pose_at(5 * S)[1].tobytes())
     for a, b in itertools.pairwise(results):
         assert a == b
+
+
+@pytest.mark.parametrize("blind_s", [1.5, 2.0, 5.0, 20.0])
+@pytest.mark.parametrize("first_yaw_rad", [-2.5, 0.3, 2.0])
+def test_a_compass_that_wakes_late_turns_nothing(blind_s, first_yaw_rad):
+    """Its zero is another than that of the frame, which was begun without it."""
+    rng = np.random.default_rng(0)
+    seeing, waking = NavigationFilter(), NavigationFilter()
+    for i in range(3000):
+        t, yaw = i * S // 10, 0.2 * math.sin(0.02 * i)
+        noisy = yaw + rng.normal(0.0, 0.01)
+        velocity = np.array([1.0, 0.0]) + rng.normal(0.0, 0.01, 2)
+        rate = 0.04 * math.cos(0.02 * i) + rng.normal(0.0, 0.003)
+        for navigation in (seeing, waking):
+            navigation.add_yaw_rate(t, rate)
+            navigation.add_velocity(t, velocity)
+        seeing.add_yaw(t, noisy)
+        if t >= blind_s * S:
+            waking.add_yaw(t, wrap_angle(noisy + first_yaw_rad))
+    ends = [navigation.pose_at(3000 * S // 10)[0] for navigation in (seeing, waking)]
+    distance, turn = ends[0].distance_to(ends[1])
+    assert distance < 5.0  # of 296 m: the frames' directions differ by half a degree
+    assert turn < 0.03

@@ -67,6 +67,8 @@ class NavigationFilter:
         self._early: list[tuple[_Key, Event]] | None = []
         self._records: list[_Record] = []
         self._memory_s = config.horizon_s
+        self._is_blind = False  # begun without a yaw
+        self._zero_rad: float | None = None
         self.num_late = 0
         self.num_invalid = 0
         self.num_outliers = 0
@@ -98,7 +100,19 @@ class NavigationFilter:
         """
         sigma = self._config.yaw_sigma_rad if sigma_rad is None else sigma_rad
         if self._is_valid(yaw_rad, sigma) and sigma > 0.0:
-            self._add(stamp_ns, Yaw(float(yaw_rad), float(sigma)), (float(yaw_rad),))
+            yaw_rad = float(yaw_rad) - self._yaw_zero_rad(stamp_ns, float(yaw_rad))
+            self._add(stamp_ns, Yaw(yaw_rad, float(sigma)), (yaw_rad,))
+
+    def _yaw_zero_rad(self, stamp_ns: int, yaw_rad: float) -> float:
+        """Yaw of the odom frame's x axis, where that was begun before there was a yaw.
+
+        Such a frame points anywhere. That is no error of the compass, which fades with time.
+        """
+        if not self._is_blind:
+            return 0.0
+        if self._zero_rad is None:
+            self._zero_rad = yaw_rad - self.pose_at(stamp_ns)[0].yaw
+        return self._zero_rad
 
     def add_yaw_rate(
         self, stamp_ns: int, yaw_rate_rad_s: float, sigma_rad_s: float | None = None
@@ -235,6 +249,9 @@ class NavigationFilter:
         config = self._config
         waiting = self._early or []
         first_yaw = next((event for _, event in waiting if isinstance(event, Yaw)), None)
+        if self._is_blind:
+            first_yaw = None  # poses were given in the frame that was begun without it
+        self._is_blind = first_yaw is None
         state = np.zeros(NUM_STATES)
         state[2] = state[13] = first_yaw.yaw_rad if first_yaw is not None else 0.0
         sigma = np.zeros(NUM_STATES)
