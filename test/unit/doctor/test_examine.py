@@ -118,3 +118,14 @@ def test_it_cannot_tell_who_is_mirrored_without_a_dvl(recording):
     found = examine(alone, pings)
     assert [finding.kind for finding in found.findings] == ["handedness"]
     assert found.conventions.changes() == {}
+
+
+def test_stops_of_commanded_velocities_are_no_lost_lock():
+    navigation, pings = vehicle(1)
+    levels = np.round(navigation.velocity_m_s * (3.0, 0.0)) / 3.0
+    stops = ((navigation.velocity_s > 30.0) & (navigation.velocity_s < 50.0))[:, None]
+    commanded = replace(navigation, velocity_m_s=np.where(stops, 0.0, levels))
+    nothing = PingSample(pings.stamp_s[:0], ())
+    assert examine(commanded, nothing).findings == []
+    measured = replace(navigation, velocity_m_s=np.where(stops, 0.0, navigation.velocity_m_s))
+    assert [f.kind for f in examine(measured, nothing).findings] == ["dvl_zero_without_lock"]

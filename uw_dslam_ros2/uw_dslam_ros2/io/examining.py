@@ -17,7 +17,7 @@ from uw_dslam_ros2.core.sonar import SonarConfig
 from uw_dslam_ros2.io.conventions import correct_mounting
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.feeding import feed
-from uw_dslam_ros2.io.readings import Reading, TransformEvent, TruthEvent
+from uw_dslam_ros2.io.readings import Reading, TransformEvent, TruthEvent, VelocityEvent
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.vehicles import VehicleRecording
 
@@ -42,8 +42,10 @@ def examine_recording(
     """
     collector = SampleCollector(sonar)
     conventions = sensors.conventions
+    is_axis_open = False
 
     def collect(is_wanted: Callable[[str, int | None], bool]) -> None:
+        nonlocal is_axis_open
         with VehicleReader(recording, sensors) as reader:
             reader.stamps = stamps
             for event in reader.events(is_wanted):
@@ -51,6 +53,7 @@ def examine_recording(
                     continue
                 try:
                     mounting = correct_mounting(event, mounting_of(event), conventions)
+                    is_axis_open |= _is_axis_open(event, mounting)
                     feed(collector, event, mounting)  # type: ignore[arg-type]  # has a mapper's inputs
                 except InvalidInputError:
                     continue  # mapping says what is wrong with it
@@ -63,7 +66,20 @@ def examine_recording(
         chosen = choose_pings(ping_s, navigation.imu_s, navigation.yaw_rate_rad_s)
         wanted = {int(stamp_ns) for stamp_ns in ping_ns[chosen]}
         collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in wanted)
-    return examine(collector.navigation(), collector.pings(), recording.vehicle_id)
+    found = examine(collector.navigation(), collector.pings(), recording.vehicle_id)
+    if is_axis_open:
+        found.findings = [
+            replace(f, severity="info") if f.kind == "dvl_mirrored" else f for f in found.findings
+        ]
+    return found
+
+
+def _is_axis_open(event: Reading, T_base_sensor: NDArray[np.float64]) -> bool:
+    """Whether a velocity is defined with y to port, in a frame whose y is to starboard.
+
+    Both are in use in such frames; that the echoes tell which is no reason to worry.
+    """
+    return isinstance(event, VelocityEvent) and not event.is_z_down and T_base_sensor[2, 2] < 0.0
 
 
 def mended(examined: Examination, known: Conventions) -> tuple[Conventions, list[Finding]]:
