@@ -129,3 +129,17 @@ def test_stops_of_commanded_velocities_are_no_lost_lock():
     assert examine(commanded, nothing).findings == []
     measured = replace(navigation, velocity_m_s=np.where(stops, 0.0, navigation.velocity_m_s))
     assert [f.kind for f in examine(measured, nothing).findings] == ["dvl_zero_without_lock"]
+
+
+def test_a_gap_of_the_imu_is_no_swing_of_its_heading():
+    navigation, pings = vehicle(1)
+    keep = (navigation.imu_s < 30.0) | (navigation.imu_s > 55.0)
+    gap = replace(
+        navigation,
+        imu_s=navigation.imu_s[keep],
+        yaw_rad=navigation.yaw_rad[keep],
+        yaw_rate_rad_s=navigation.yaw_rate_rad_s[keep],
+    )
+    assert examine(gap, PingSample(pings.stamp_s[:0], ())).findings == []
+    silent = replace(navigation, yaw_rad=np.where(keep, navigation.yaw_rad, np.nan))
+    assert examine(silent, PingSample(pings.stamp_s[:0], ())).findings == []

@@ -17,6 +17,7 @@ FloatArray = NDArray[np.float64]
 _WINDOW_S = 1.5
 _MIN_TURN_RAD = 0.5
 _SWING_S = 30.0
+_GAP_S = 1.0  # over which nobody knows how the vehicle turned
 _DEGREES = 180.0 / math.pi
 
 
@@ -59,7 +60,9 @@ def compare_yaw_and_rate(
     if by_yaw is not None and by_rates is not None:
         ratio = _ratio(imu_s, by_yaw, by_rates)
         if math.isfinite(ratio):
-            swing_rad = _swing(imu_s, by_yaw, by_rates / _nearest(ratio))
+            is_said = has_yaw & has_rate
+            difference = by_yaw - by_rates / _nearest(ratio)
+            swing_rad = _swing(imu_s[is_said], difference[is_said])
     return ImuState(by_yaw, by_rates, is_constant, are_zero, ratio, swing_rad)
 
 
@@ -86,9 +89,13 @@ def _ratio(imu_s: FloatArray, yaw: FloatArray, rates: FloatArray) -> float:
     return middle if middle and spread < 0.3 * abs(middle) else math.nan
 
 
-def _swing(imu_s: FloatArray, yaw: FloatArray, rates: FloatArray) -> float:
+def _swing(imu_s: FloatArray, difference: FloatArray) -> float:
+    """Largest change within 30 s of a difference (K,), of which nothing is known over gaps."""
+    if len(imu_s) < 2:
+        return math.nan
+    steps = np.where(np.diff(imu_s) > _GAP_S, 0.0, np.diff(difference))
     grid = np.arange(imu_s[0], imu_s[-1], 0.5)
-    difference = at_times(grid, imu_s, yaw - rates)
+    difference = at_times(grid, imu_s, np.concatenate([[0.0], np.cumsum(steps)]))
     known = np.isfinite(difference)
     if known.sum() < 20:
         return math.nan
