@@ -29,8 +29,9 @@ def bag(tmp_path_factory):
             rate = 0.3 * math.sin(0.02 * k)
             writer.write("/auv_1/imu", stamp_ns, make.imu(stamp_ns, "", 0.0, 0.0, rate, 1e-6))
             types = writer.typestore.types
+            measured = 0.8 + 0.01 * math.sin(k)  # a measurement never repeats to the last digit
             linear = types["geometry_msgs/msg/Vector3"](
-                x=0.0 if 200 < k < 300 else 0.8, y=0.0, z=0.0
+                x=0.0 if 200 < k < 300 else measured, y=0.0, z=0.0
             )
             twist = types["geometry_msgs/msg/Twist"](
                 linear=linear, angular=types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
