@@ -22,6 +22,7 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import Beams
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.readings import (
+    PINGS,
     BeamsEvent,
     DepthEvent,
     FixEvent,
@@ -41,7 +42,6 @@ FloatArray = NDArray[np.float64]
 
 SensorEvent = Reading
 
-_PINGS = (ImageEvent, ScanEvent, PointsEvent, BeamsEvent)
 _HOLD_NS = 2_000_000_000
 _NOTABLE_TILT_RAD = math.radians(10.0)  # shortens ranges by 1.5 %
 
@@ -67,7 +67,7 @@ def in_stamp_order[EventT](events: Iterable[EventT]) -> Iterator[EventT]:
 
 
 def _rank(event: SensorEvent) -> int:
-    return 0 if isinstance(event, ImuEvent) else 1 + isinstance(event, _PINGS)
+    return 0 if isinstance(event, ImuEvent) else 1 + isinstance(event, PINGS)
 
 
 class Mountings:

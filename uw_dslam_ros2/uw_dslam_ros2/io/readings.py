@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import SonarImage
 
 __all__ = [
+    "PINGS",
     "BeamsEvent",
     "DepthEvent",
     "Event",
@@ -239,5 +240,8 @@ Reading = (
     | FixEvent
 )
 """What an instrument's message becomes."""
+
+PINGS = (ImageEvent, ScanEvent, PointsEvent, BeamsEvent)
+"""Readings of a sonar."""
 
 Event = Reading | TransformEvent | TruthEvent

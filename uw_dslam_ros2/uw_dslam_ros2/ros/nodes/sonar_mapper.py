@@ -26,11 +26,8 @@ from uw_dslam_ros2.io.conventions import correct, correct_mounting
 from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed
 from uw_dslam_ros2.io.readings import (
-    BeamsEvent,
+    PINGS,
     DepthEvent,
-    ImageEvent,
-    PointsEvent,
-    ScanEvent,
 )
 from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_to_msg,
@@ -58,7 +55,6 @@ from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["SonarMapper", "SonarMapperConfig", "main"]
 
-_PINGS = (ImageEvent, ScanEvent, PointsEvent, BeamsEvent)
 _JUMP_BACK_S = 1.0  # stamps that go back by more begin a new recording
 _PATH_MAX_POSES = 2000  # a longer path is thinned when published
 _MAX_AHEAD_NS = 10_000_000_000
@@ -316,7 +312,7 @@ class SonarMapper(Node):
             return
         if stamp_ns - self._odom_stamp_ns >= _ODOM_PERIOD_NS:
             self._publish_odometry(stamp_ns)
-        if isinstance(event, _PINGS):
+        if isinstance(event, PINGS):
             self._mapper_values = self._mapper.diagnostics()
             is_old = stamp_ns - self._map_stamp_ns >= self._config.map_period_s * 1e9
             if is_old and self._drawing.is_due():
