@@ -123,6 +123,23 @@ def test_evaluate_compares_two_files(result_folder, capsys) -> None:
     assert json.loads(capsys.readouterr().out)["trajectory"]["rmse_m"] < 1e-3
 
 
+def test_evaluate_puts_others_beside_it(result_folder, capsys) -> None:
+    file = result_folder / "result" / "trajectories" / "auv_1.tum"
+    true = result_folder / "truth" / "auv_1.tum"
+    write_tum(result_folder / "others" / "same.tum", missions.STAMPS, missions.WAY)
+    beside = ["--beside", str(result_folder / "others")]
+    assert evaluate.main([str(file), "--truth", str(true), *beside, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rmse_m_of_others"]["same"] < 1e-3
+    assert evaluate.main([str(file), "--truth", str(true), *beside]) == 0
+    assert "same: 0.000 m" in capsys.readouterr().out
+    result = str(result_folder / "result")
+    assert evaluate.main([result, "--truth", str(true.parent), *beside]) == 2
+    assert "--beside needs a truth of one vehicle, this one has 3" in capsys.readouterr().err
+    beside[1] = str(result_folder / "nothing")
+    assert evaluate.main([str(file), "--truth", str(true), *beside]) == 2
+    assert "holds no .tum file" in capsys.readouterr().err
+
+
 def test_evaluate_says_when_there_is_nothing_to_compare(result_folder, capsys) -> None:
     other = result_folder / "other"
     write_tum(other / "ship.tum", missions.STAMPS, missions.WAY)

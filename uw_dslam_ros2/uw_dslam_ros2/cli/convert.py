@@ -9,7 +9,12 @@ from pathlib import Path
 
 from uw_dslam_ros2.cli.common import parser_for, progress_bar, run_command
 from uw_dslam_ros2.core.errors import DataError
-from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
+from uw_dslam_ros2.io.datasets.aracati2017 import (
+    read_aracati2017,
+    read_published_runs,
+    write_bags,
+)
+from uw_dslam_ros2.io.trajectories import write_tum
 
 __all__ = ["main"]
 
@@ -30,10 +35,17 @@ def _run(args: argparse.Namespace) -> int:
         if (args.out / name).exists():
             raise DataError(f"{args.out / name} is there already; give another folder")
     recording = read_aracati2017(args.data)
+    published = read_published_runs(args.data)
     with progress_bar("convert", "bag") as progress:
         bags = write_bags(recording, args.out, storage=args.storage, progress=progress)
     print(f"{len(bags)} bags: {', '.join(map(str, bags))}")
     print(f"truth (DGPS), only for scoring: {args.out / 'truth'}")
+    for name, (stamps_ns, poses) in published.items():
+        file = args.out / "published" / f"{name.replace(', ', '_').replace(' ', '_')}.tum"
+        file.parent.mkdir(exist_ok=True)
+        write_tum(file, stamps_ns, poses)
+    if published:
+        print(f"{len(published)} runs that others published: {args.out / 'published'}")
     return 0
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 from uw_dslam_ros2.cli.common import parser_for, run_command
 from uw_dslam_ros2.cli.outcome import Trajectory, json_bytes
 from uw_dslam_ros2.cli.report import whose_error
-from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M, Scores, read_truth, score
+from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M, Scores, Truth, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.trajectories import read_tum
 
@@ -44,6 +45,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="TRUTH",
         help="folder with <vehicle>.tum and perhaps map.yaml, or the TUM file of one vehicle",
     )
+    parser.add_argument(
+        "--beside",
+        type=Path,
+        metavar="FOLDER",
+        help="folder with trajectories of other programs (TUM) of the same recording; each is "
+        "scored in the same way, against the truth of the one vehicle that the truth has",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
 
@@ -62,11 +70,33 @@ def _run(args: argparse.Namespace) -> int:
     map_file = args.result / "global_map.yaml"
     global_map = read_map(map_file) if map_file.is_file() else None
     scores = score(global_map, trajectories, own or trajectories, truth)
+    others = {} if args.beside is None else _beside(args.beside, truth)
     if args.json:
-        sys.stdout.write(json_bytes(scores.to_dict()).decode())
+        report = scores.to_dict()
+        if others:
+            report["rmse_m_of_others"] = others
+        sys.stdout.write(json_bytes(report).decode())
     else:
         print("\n".join(_lines(scores)))
+        if others:
+            print(f"beside it, the trajectories in {args.beside}, RMSE after a motion of its own:")
+        for name, rmse_m in sorted(others.items(), key=lambda item: item[1]):
+            print(f"  {name}: {rmse_m:.3f} m")
     return 0
+
+
+def _beside(folder: Path, truth: Truth) -> dict[str, float]:
+    """Score each TUM file of a folder against the truth of the only vehicle; RMSE [m] by name."""
+    if len(truth.trajectories) != 1:
+        raise DataError(
+            f"--beside needs a truth of one vehicle, this one has {len(truth.trajectories)}: "
+            f"{', '.join(sorted(truth.trajectories))}"
+        )
+    files = sorted(folder.glob("*.tum"))
+    if not files:
+        raise DataError(f"{folder} holds no .tum file; expected one for each run")
+    (true,) = truth.trajectories.values()
+    return {file.stem: trajectory_error({"": read_tum(file)}, {"": true}).rmse_m for file in files}
 
 
 def _trajectories(result: Path) -> tuple[dict[str, Trajectory], dict[str, Trajectory]]:

@@ -1,10 +1,12 @@
 """Aracati 2017, a forward-looking sonar in a marina, from tables (CSV) to bags.
 
-The tables hold the detections of each key ping, velocity commands, a compass, and DGPS as truth.
+The tables hold the detections of each key ping, velocity commands, a compass, and DGPS as truth;
+perhaps also trajectories that others' software made of it, to be scored beside ours.
 """
 
 from __future__ import annotations
 
+import csv
 import gzip
 import zlib
 from collections.abc import Callable, Iterator
@@ -21,7 +23,14 @@ from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.recordings import BagWriter
 from uw_dslam_ros2.io.trajectories import write_tum
 
-__all__ = ["SEGMENTS", "AracatiRecording", "read_aracati2017", "write_bag", "write_bags"]
+__all__ = [
+    "SEGMENTS",
+    "AracatiRecording",
+    "read_aracati2017",
+    "read_published_runs",
+    "write_bag",
+    "write_bags",
+]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -36,6 +45,7 @@ _COLUMNS = {
     "compass": ("time_s", "compass_rad"),
     "dgps": ("time_s", "x_m", "y_m"),
 }
+_PUBLISHED_COLUMNS = ("run", "kind", "time_s", "x_m", "y_m", "yaw_rad")
 # Navigation before the first and after the last key ping of a bag.
 _LEAD_NS, _TAIL_NS = 2_000_000_000, 1_000_000_000
 # The commands are an open-loop odometer; what it is off by slowly is the mapper's setting.
@@ -108,6 +118,30 @@ def read_aracati2017(folder: str | Path) -> AracatiRecording:
         _nanoseconds(tables["dgps"][:, 0]),
         tables["dgps"][:, 1:],
     )
+
+
+def read_published_runs(folder: str | Path) -> dict[str, tuple[IntArray, FloatArray]]:
+    """Trajectories of others' runs on this recording, by "kind, run"; none where no table is.
+
+    Each is stamps (K,) [ns] and poses (K, 3) [x, y, yaw] in a frame of its own: never an input.
+
+    Raises
+    ------
+    DataError
+        Naming the file and what is wrong in it.
+    """
+    path = _table_path(Path(folder), "bruce_runs")
+    if not path.exists():
+        return {}
+    rows: dict[str, list[list[float]]] = {}
+    for number, words in enumerate(_rows(path, _PUBLISHED_COLUMNS), start=2):
+        if len(words) != len(_PUBLISHED_COLUMNS):
+            raise DataError(f"{path}, line {number}: {len(words)} columns, expected 6")
+        rows.setdefault(f"{words[1]}, {words[0]}", []).append(
+            _numbers(path, number, words[2:]),
+        )
+    tables = {name: np.array(values, dtype=np.float64) for name, values in sorted(rows.items())}
+    return {name: (_nanoseconds(table[:, 0]), table[:, 1:]) for name, table in tables.items()}
 
 
 def write_bags(
@@ -209,29 +243,43 @@ def _messages(
 
 def _table(folder: Path, name: str) -> FloatArray:
     columns = _COLUMNS[name]
+    path = _table_path(folder, name)
+    lines = _rows(path, columns)
+    rows = [_numbers(path, number, words) for number, words in enumerate(lines, start=2)]
+    if any(len(row) != len(columns) for row in rows):
+        raise DataError(f"{path}: expected {len(columns)} numbers in each line")
+    if not rows:
+        raise DataError(f"{path} has no rows")
+    return np.array(rows, dtype=np.float64)
+
+
+def _table_path(folder: Path, name: str) -> Path:
     path = folder / f"{name}.csv.gz"
-    if not path.exists():
-        path = folder / f"{name}.csv"
+    return path if path.exists() else folder / f"{name}.csv"
+
+
+def _rows(path: Path, columns: tuple[str, ...]) -> list[list[str]]:
     try:
         data = path.read_bytes()
         text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
     except FileNotFoundError as error:
-        raise DataError(f"{folder / name}.csv.gz is missing") from error
+        raise DataError(f"{path}.gz is missing") from error
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read: {error}") from error
     lines = text.splitlines()
     if not lines or tuple(lines[0].strip().split(",")) != columns:
         raise DataError(f"{path}: line 1 must be {','.join(columns)}")
+    return list(csv.reader(lines[1:]))
+
+
+def _numbers(path: Path, number: int, words: list[str]) -> list[float]:
     try:
-        rows = [[float(value) for value in line.split(",")] for line in lines[1:]]
-        table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
+        values = [float(word) for word in words]
     except ValueError as error:
-        raise DataError(
-            f"{path}: {error}; expected {len(columns)} numbers in each line"
-        ) from error
-    if len(table) == 0 or not np.isfinite(table).all():
-        raise DataError(f"{path} has no rows, or values that are not finite")
-    return table
+        raise DataError(f"{path}, line {number}: {error}") from error
+    if not np.isfinite(values).all():
+        raise DataError(f"{path}, line {number}: {','.join(words)} is not finite")
+    return values
 
 
 def _nanoseconds(time_s: FloatArray) -> IntArray:
