@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,20 +17,23 @@ from uw_dslam_ros2.core.sonar import SonarConfig
 from uw_dslam_ros2.io.conventions import correct_mounting
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.feeding import feed
-from uw_dslam_ros2.io.readings import Reading, TransformEvent, TruthEvent, VelocityEvent
+from uw_dslam_ros2.io.readings import Event, Reading, TransformEvent, TruthEvent, VelocityEvent
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.vehicles import VehicleRecording
 
-__all__ = ["examine_recording", "mended"]
+__all__ = ["examine_readings", "examine_recording", "mended"]
 
 MountingOf = Callable[[Reading], NDArray[np.float64]]
+IsWanted = Callable[[str, int | None], bool]
+Source = Callable[[IsWanted], Iterable[Event]]
+"""Readings whose role and stamp are wanted; it may be asked more than once."""
 
 
 def examine_recording(
     recording: VehicleRecording,
     sensors: SensorConfig,
     sonar: SonarConfig,
-    stamps: dict[str, NDArray[np.int64]],
+    stamps: Mapping[str, NDArray[np.int64]],
     mounting_of: MountingOf,
 ) -> Examination:
     """Try the conventions of a vehicle's sensors.
@@ -40,23 +43,40 @@ def examine_recording(
     stamps : role -> times (N,) [ns] of all its messages, as `VehicleReader.check_clocks` has them.
     mounting_of : ``T_base_sensor`` (4, 4) of a reading.
     """
+
+    def source(is_wanted: IsWanted) -> Iterable[Event]:
+        with VehicleReader(recording, sensors) as reader:
+            reader.stamps = dict(stamps)
+            yield from reader.events(is_wanted)
+
+    return examine_readings(
+        source, sensors.conventions, sonar, stamps, mounting_of, recording.vehicle_id
+    )
+
+
+def examine_readings(
+    source: Source,
+    conventions: Conventions,
+    sonar: SonarConfig,
+    stamps: Mapping[str, NDArray[np.int64]],
+    mounting_of: MountingOf,
+    vehicle_id: str = "",
+) -> Examination:
+    """Try the conventions of a vehicle's sensors; parameters as in `examine_recording`."""
     collector = SampleCollector(sonar)
-    conventions = sensors.conventions
     is_axis_open = False
 
-    def collect(is_wanted: Callable[[str, int | None], bool]) -> None:
+    def collect(is_wanted: IsWanted) -> None:
         nonlocal is_axis_open
-        with VehicleReader(recording, sensors) as reader:
-            reader.stamps = stamps
-            for event in reader.events(is_wanted):
-                if isinstance(event, TruthEvent | TransformEvent):
-                    continue
-                try:
-                    mounting = correct_mounting(event, mounting_of(event), conventions)
-                    is_axis_open |= _is_axis_open(event, mounting)
-                    feed(collector, event, mounting)  # type: ignore[arg-type]  # has a mapper's inputs
-                except InvalidInputError:
-                    continue  # mapping says what is wrong with it
+        for event in source(is_wanted):
+            if isinstance(event, TruthEvent | TransformEvent):
+                continue
+            try:
+                mounting = correct_mounting(event, mounting_of(event), conventions)
+                is_axis_open |= _is_axis_open(event, mounting)
+                feed(collector, event, mounting)  # type: ignore[arg-type]  # has a mapper's inputs
+            except InvalidInputError:
+                continue  # mapping says what is wrong with it
 
     collect(lambda role, _: role in ("imu", "velocity"))
     navigation = collector.navigation()
@@ -66,7 +86,7 @@ def examine_recording(
         chosen = choose_pings(ping_s, navigation.imu_s, navigation.yaw_rate_rad_s)
         wanted = {int(stamp_ns) for stamp_ns in ping_ns[chosen]}
         collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in wanted)
-    found = examine(collector.navigation(), collector.pings(), recording.vehicle_id)
+    found = examine(collector.navigation(), collector.pings(), vehicle_id)
     if is_axis_open:
         found.findings = [
             replace(f, severity="info") if f.kind == "dvl_mirrored" else f for f in found.findings
