@@ -10,7 +10,7 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.recordings import open_bag
 from uw_dslam_ros2.sim.mission import T_BASE_SONAR, plan_mission, tiny_mission_config
 from uw_dslam_ros2.sim.recording import simulate_mission
-from uw_dslam_ros2.sim.turning import TurningSonarConfig, beam_bearing_rad
+from uw_dslam_ros2.sim.turning import TurningSonarConfig, beam_bearing_rad, counted_rad
 
 TURNING = TurningSonarConfig(turn_s=4.0, num_beams=50, num_ranges=300)
 CONFIG = replace(
@@ -77,3 +77,31 @@ def test_ranges_are_those_of_the_place_at_each_beams_time(recorded):
     assert len(off_m) > 0.3 * len(recorded["beam"])
     # Fish and ghosts answer too, and before a wall.
     assert np.median(off_m) < 0.15
+
+
+def test_a_sonar_whose_zero_is_elsewhere_counts_from_there():
+    config = replace(TURNING, zero_rad=math.radians(94.0), is_clockwise=True)
+    assert counted_rad(config, math.radians(94.0)) == 0.0
+    assert counted_rad(config, math.radians(104.0)) == pytest.approx(math.radians(-10.0))
+    assert counted_rad(TURNING, 0.3) == pytest.approx(0.3)
+
+
+def test_points_of_a_turn_are_those_of_its_middle(tmp_path):
+    turning = replace(TURNING, message="points", zero_rad=0.4, is_clockwise=True)
+    config = replace(CONFIG, turning=turning)
+    bag = simulate_mission(tmp_path / "points", config).bags[0]
+    mission = plan_mission(config)
+    (run,) = mission.runs
+    with open_bag(bag) as reader:
+        clouds = [reader.deserialize(raw) for raw in reader.raw() if raw.topic == "/auv_1/scan"]
+    assert len(clouds) == run.num_pings // TURNING.num_beams
+    for k, cloud in enumerate(clouds):
+        middle = k * TURNING.num_beams + TURNING.num_beams // 2
+        assert stamp_ns(cloud) == run.ping_motion.stamp_ns[middle]
+        x, y = cloud.data.view("<f4").reshape(-1, 3)[:, :2].T.astype(float)
+        sonar = run.ping_motion.pose(middle) @ T_BASE_SONAR
+        bearing = sonar.yaw + turning.zero_rad + np.arctan2(-y, x)
+        true_m = mission.world.cast((sonar.x, sonar.y), bearing, TURNING.max_range_m).range_m
+        known = np.isfinite(true_m)
+        # Seen from elsewhere a wall may hide behind another, and fish are no walls.
+        assert np.median(np.abs(true_m - np.hypot(x, y))[known]) < 0.3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from dataclasses import replace
@@ -15,6 +16,7 @@ from uw_dslam_ros2.sim.instruments import HEADING_SOURCES
 from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
 from uw_dslam_ros2.sim.places import PLACES
 from uw_dslam_ros2.sim.recording import simulate_mission
+from uw_dslam_ros2.sim.turning import TURNING_MESSAGES
 
 __all__ = ["main"]
 
@@ -43,9 +45,29 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--message",
-        choices=("beam", "turn"),
+        choices=TURNING_MESSAGES,
         default=default.turning.message,
-        help="what a LaserScan of a turning sonar holds",
+        help="what a message of a turning sonar holds; points are deskewed",
+    )
+    parser.add_argument(
+        "--zero",
+        type=float,
+        default=0.0,
+        metavar="DEG",
+        help="turning sonar: where its zero really points, counter-clockwise from ahead",
+    )
+    parser.add_argument(
+        "--clockwise", action="store_true", help="turning sonar: its angles grow clockwise"
+    )
+    parser.add_argument(
+        "--imu-delay",
+        type=float,
+        default=default.instruments.imu_delay_s,
+        metavar="S",
+        help="how much later than true the stamps of the imu are",
+    )
+    parser.add_argument(
+        "--width", type=float, default=0.0, metavar="M", help="of the place; 0: by the vehicles"
     )
     parser.add_argument("--ping-rate", type=float, default=default.ping_rate_hz, metavar="HZ")
     parser.add_argument("--beams", type=int, default=default.sonar.num_beams)
@@ -69,6 +91,7 @@ def _config(arguments: argparse.Namespace) -> MissionConfig:
         seed=arguments.seed,
         place=arguments.place,
         num_vehicles=arguments.vehicles,
+        place_width_m=arguments.width,
         duration_s=arguments.duration,
         overlap=arguments.overlap,
         ping_rate_hz=arguments.ping_rate,
@@ -82,10 +105,14 @@ def _config(arguments: argparse.Namespace) -> MissionConfig:
         turning=replace(
             default.turning,
             message=arguments.message,
+            zero_rad=math.radians(arguments.zero),
+            is_clockwise=arguments.clockwise,
             max_range_m=arguments.max_range or default.turning.max_range_m,
         ),
         drive=replace(default.drive, speed_m_s=arguments.speed),
-        instruments=replace(default.instruments, heading_source=arguments.heading),
+        instruments=replace(
+            default.instruments, heading_source=arguments.heading, imu_delay_s=arguments.imu_delay
+        ),
     )
 
 

@@ -36,6 +36,9 @@ class InstrumentConfig(Config):
 
     heading_source: str = setting("gyro", choices=HEADING_SOURCES, doc="what yaw is made of")
     imu_rate_hz: float = setting(25.0, 1.0, 400.0, "IMU messages per second")
+    imu_delay_s: float = setting(
+        0.0, -5.0, 5.0, "how much later than true the stamps of the IMU are [s]"
+    )
     yaw_noise_rad: float = setting(math.radians(0.15), 0.0, 0.5, "white noise of the yaw [rad]")
     gyro_noise_rad_s: float = setting(1.0e-3, 0.0, 0.1, "white noise of the yaw rate [rad/s]")
     gyro_bias_deg_h: float = setting(
@@ -96,12 +99,13 @@ def measure(
 
     The place matters to a compass only; without one nothing deflects it.
     """
-    imu = motion.at(_stamps(motion, config.imu_rate_hz, 0))
+    imu_stamp_ns = _stamps(motion, config.imu_rate_hz, 0)
+    imu = motion.at(imu_stamp_ns - round(config.imu_delay_s * _NS))
     yaw, yaw_rate = _imu_readings(imu, config, rng, world)
     dvl = motion.at(_stamps(motion, config.dvl_rate_hz, 13_000_000))
     depth = motion.at(_stamps(motion, config.depth_rate_hz, 29_000_000))
     return NavigationLog(
-        imu_stamp_ns=imu.stamp_ns,
+        imu_stamp_ns=imu_stamp_ns,
         yaw_rad=yaw,
         yaw_rate_rad_s=yaw_rate,
         dvl_stamp_ns=dvl.stamp_ns,

@@ -7,13 +7,16 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.config import SonarConfig
 from uw_dslam_ros2.core.sonar.detect import image_echoes
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.recordings import BagWriter
 from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, Mission, VehicleRun
+from uw_dslam_ros2.sim.turning import counted_rad
 
 __all__ = ["TRUTH_STEP", "VehicleRecorder"]
 
@@ -42,8 +45,12 @@ class VehicleRecorder:
         self._base, self._sonar = f"{who}/base_link", f"{who}/sonar"
         writer.add_topic("/tf_static", "tf2_msgs/msg/TFMessage", is_latched=True)
         self._beams: list[SonarImage] = []
+        self._num_beams = 0
+        self._turning_topic = f"/{who}/scan"
         if self._config.is_turning:
-            writer.add_topic(f"/{who}/scan", "sensor_msgs/msg/LaserScan")
+            is_cloud = self._config.turning.message == "points"
+            kind = "PointCloud2" if is_cloud else "LaserScan"
+            writer.add_topic(self._turning_topic, f"sensor_msgs/msg/{kind}")
         else:
             writer.add_topic(f"/{who}/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
         writer.add_topic(f"/{who}/imu", "sensor_msgs/msg/Imu")
@@ -90,29 +97,55 @@ class VehicleRecorder:
             return
         self._beams.append(image)
         turning = self._config.turning
-        if len(self._beams) < (turning.num_beams if turning.message == "turn" else 1):
+        if len(self._beams) < (1 if turning.message == "beam" else turning.num_beams):
             return
-        self._write_scan(self._beams)
+        if turning.message == "points":
+            self._write_points(self._beams)
+        else:
+            self._write_scan(self._beams)
+        self._num_beams += len(self._beams)
         self._beams = []
 
-    def _write_scan(self, beams: list[SonarImage]) -> None:
-        """First echoes, as a driver finds them; stamped with the first beam's time."""
-        turning = self._config.turning
+    def _ranges(self, beams: list[SonarImage]) -> NDArray[np.float64]:
+        """First echoes, as a driver finds them; infinity where there is none."""
         ranges = np.full(len(beams), np.inf)
         for i, beam in enumerate(beams):
             found = image_echoes(beam, SonarConfig())
             if len(found.range_m):
                 ranges[i] = found.range_m[0]
+        return ranges
+
+    def _write_scan(self, beams: list[SonarImage]) -> None:
+        """Stamped with the first beam's time."""
+        turning = self._config.turning
+        step_rad = 2.0 * math.pi / turning.num_beams
         message = self._make.laser_scan(
             beams[0].stamp_ns,
             self._sonar,
-            angle_min_rad=float(beams[0].bearing_rad[0]),
-            angle_increment_rad=2.0 * math.pi / turning.num_beams,
+            angle_min_rad=counted_rad(turning, float(beams[0].bearing_rad[0])),
+            angle_increment_rad=-step_rad if turning.is_clockwise else step_rad,
             time_increment_s=turning.interval_s,
-            ranges_m=ranges,
+            ranges_m=self._ranges(beams),
             range_limits_m=(self._config.sonar.min_range_m, turning.max_range_m),
         )
-        self._writer.write(f"/{self._run.vehicle_id}/scan", beams[-1].stamp_ns, message)
+        self._writer.write(self._turning_topic, beams[-1].stamp_ns, message)
+
+    def _write_points(self, beams: list[SonarImage]) -> None:
+        """Echoes of a turn as heard from the sonar's true place in its middle."""
+        turning, middle = self._config.turning, len(beams) // 2
+        motion, T_base_sonar = self._run.ping_motion, self._run.T_base_sonar
+        T_middle_map = (motion.pose(self._num_beams + middle) @ T_base_sonar).inverse()
+        ranges = self._ranges(beams)
+        points = []
+        for i in np.flatnonzero(np.isfinite(ranges)):
+            T_middle_sonar = T_middle_map @ motion.pose(self._num_beams + int(i)) @ T_base_sonar
+            bearing = float(beams[i].bearing_rad[0])
+            echo = (ranges[i] * math.cos(bearing), ranges[i] * math.sin(bearing))
+            points.append(T_middle_sonar.apply(np.array([echo]))[0])
+        seen = SE2(yaw=-turning.zero_rad).apply(np.array(points).reshape(-1, 2))
+        seen[:, 1] *= -1.0 if turning.is_clockwise else 1.0
+        message = self._make.points(beams[middle].stamp_ns, self._sonar, seen)
+        self._writer.write(self._turning_topic, beams[-1].stamp_ns, message)
 
     def _write_image(self, image: SonarImage) -> None:
         message = self._make.sonar_image(

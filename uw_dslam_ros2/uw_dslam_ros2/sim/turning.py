@@ -15,7 +15,16 @@ from uw_dslam_ros2.sim.sonar import SonarSimulator
 from uw_dslam_ros2.sim.sonar_model import SonarConfig
 from uw_dslam_ros2.sim.world import World
 
-__all__ = ["TurningSonarConfig", "TurningSonarSimulator", "beam_bearing_rad"]
+__all__ = [
+    "TURNING_MESSAGES",
+    "TurningSonarConfig",
+    "TurningSonarSimulator",
+    "beam_bearing_rad",
+    "counted_rad",
+]
+
+TURNING_MESSAGES = ("beam", "turn", "points")
+"""What a message of the sonar can hold."""
 
 _FAN_BEAMS, _FAN_RAD = 9, 0.12
 """A narrow fan around the beam, of which the middle is kept: what it hears from beside it."""
@@ -34,8 +43,14 @@ class TurningSonarConfig(Config):
     num_ranges: int = setting(600, 16, 20000, "range bins")
     max_range_m: float = setting(30.0, 1.0, 200.0, "outer edge of the last range bin [m]")
     message: str = setting(
-        "beam", choices=("beam", "turn"), doc="a LaserScan holds one beam, or a turn"
+        "beam",
+        choices=TURNING_MESSAGES,
+        doc="a LaserScan holds one beam or a turn; or the points of a turn, deskewed",
     )
+    zero_rad: float = setting(
+        0.0, -math.pi, math.pi, "where its zero really points, counter-clockwise from ahead [rad]"
+    )
+    is_clockwise: bool = setting(False, doc="its angles grow clockwise, and nobody says so")
 
     @property
     def interval_s(self) -> float:
@@ -46,6 +61,12 @@ class TurningSonarConfig(Config):
 def beam_bearing_rad(config: TurningSonarConfig, index: int) -> float:
     """Where the beam of some number points: counter-clockwise from ahead."""
     return wrap_angle(2.0 * math.pi * (index % config.num_beams) / config.num_beams)
+
+
+def counted_rad(config: TurningSonarConfig, bearing_rad: float) -> float:
+    """What the sonar says of a bearing."""
+    side = -1.0 if config.is_clockwise else 1.0
+    return side * wrap_angle(bearing_rad - config.zero_rad)
 
 
 class TurningSonarSimulator:
