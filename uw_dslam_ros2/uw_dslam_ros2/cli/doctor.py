@@ -130,12 +130,12 @@ def _diagnose(
         )
         for gap in find_gaps(stamps)
     ]
-    if examined.num_ping_motions < _FEW_MOTIONS:
+    if examined.num_ping_motions < _FEW_MOTIONS and not examined.num_turning_windows:
         findings.append(
             Finding(
                 "cannot_tell",
                 "sonar",
-                "too few pings show how it moved (a sonar that turns, few echoes or no imu), so "
+                "too few pings or turns show how it moved (few echoes, little way, or no imu), so "
                 "the conventions of imu, dvl and sonar cannot be told from each other",
                 severity="info",
                 vehicle_id=recording.vehicle_id,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, SampleCollector, examine
 from uw_dslam_ros2.core.doctor.bursts import choose_pings
+from uw_dslam_ros2.core.doctor.turning_verdict import choose_spans, examine_turning
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.sonar import SonarConfig
@@ -22,6 +23,9 @@ from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.vehicles import VehicleRecording
 
 __all__ = ["examine_readings", "examine_recording", "mended"]
+
+_SLOW_NS = 3_000_000_000
+_TURN_NS = 40_000_000_000
 
 MountingOf = Callable[[Reading], NDArray[np.float64]]
 IsWanted = Callable[[str, int | None], bool]
@@ -87,11 +91,34 @@ def examine_readings(
         wanted = {int(stamp_ns) for stamp_ns in ping_ns[chosen]}
         collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in wanted)
     found = examine(collector.navigation(), collector.pings(), vehicle_id)
+    if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):
+        spans = choose_spans(navigation, collector.seconds(np.unique(stamps["sonar"])))
+        inside = _inside(spans, collector.start_ns)
+        collect(lambda role, stamp_ns: role == "sonar" and inside(stamp_ns))
+        examine_turning(found, navigation, collector.beams(), spans, vehicle_id)
     if is_axis_open:
         found.findings = [
             replace(f, severity="info") if f.kind == "dvl_mirrored" else f for f in found.findings
         ]
     return found
+
+
+def _are_slow(stamps_ns: NDArray[np.int64]) -> bool:
+    """Whether pings come as seldom as the turns of a sonar."""
+    return len(stamps_ns) > 1 and float(np.median(np.diff(np.unique(stamps_ns)))) > _SLOW_NS
+
+
+def _inside(spans: Iterable[tuple[float, float]], start_ns: int) -> Callable[[int | None], bool]:
+    """Whether a stamp lies in one of the spans [s]; a turn is stamped with its begin."""
+    bounds = [
+        (start_ns + int(1e9 * begin_s) - _TURN_NS, start_ns + int(1e9 * end_s))
+        for begin_s, end_s in spans
+    ]
+
+    def is_inside(stamp_ns: int | None) -> bool:
+        return stamp_ns is not None and any(a <= stamp_ns < b for a, b in bounds)
+
+    return is_inside
 
 
 def _is_axis_open(event: Reading, T_base_sensor: NDArray[np.float64]) -> bool:

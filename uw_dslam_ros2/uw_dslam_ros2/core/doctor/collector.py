@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
+from uw_dslam_ros2.core.doctor.turning import BeamSample
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
+    BeamGatherer,
+    Beams,
     Detections,
     SonarConfig,
     SonarImage,
@@ -18,6 +21,7 @@ from uw_dslam_ros2.core.sonar import (
     detections_from_points,
     detections_from_scan,
 )
+from uw_dslam_ros2.core.sonar.turning import beams_of_image, is_few_beams
 from uw_dslam_ros2.core.submap import Submap
 
 __all__ = ["SampleCollector"]
@@ -37,6 +41,7 @@ class SampleCollector:
         self._velocity: list[tuple[int, float, float]] = []
         self._T_base_dvl = SE2()
         self._pings: list[tuple[int, FloatArray]] = []
+        self._beams: list[tuple[Beams, SE2, FloatArray | None]] = []
         self._T_base_sonar = SE2()
 
     @property
@@ -89,14 +94,19 @@ class SampleCollector:
     def add_pose(self, *_: Any, **__: Any) -> None:
         """The vehicle's own odometry is not examined."""
 
-    def add_beams(self, *_: Any, **__: Any) -> list[Submap]:
-        """Single beams do not show from ping to ping how the sonar moved."""
+    def add_beams(
+        self, beams: Beams, T_base_sonar: SE2, projection: FloatArray | None = None
+    ) -> list[Submap]:
+        """As a mapper's: beams of a sonar that turns."""
+        self._beams.append((beams, T_base_sonar, projection))
         return []
 
     def add_image(
         self, image: SonarImage, T_base_sonar: SE2, projection: FloatArray | None = None
     ) -> list[Submap]:
         """As a mapper's."""
+        if is_few_beams(image):
+            return self.add_beams(beams_of_image(image), T_base_sonar, projection)
         return self._add(detect(image, self._sonar), T_base_sonar, projection)
 
     def add_scan(
@@ -137,10 +147,10 @@ class SampleCollector:
         imu, velocity = _sorted(self._imu), _sorted(self._velocity)
         mount = self._T_base_dvl
         return NavigationSample(
-            self._seconds([row[0] for row in imu]),
+            self.seconds([row[0] for row in imu]),
             np.array([row[1] for row in imu]),
             np.array([row[2] for row in imu]),
-            self._seconds([row[0] for row in velocity]),
+            self.seconds([row[0] for row in velocity]),
             np.array([row[1:] for row in velocity]).reshape(-1, 2),
             (mount.x, mount.y),
         )
@@ -149,13 +159,40 @@ class SampleCollector:
         """What the sonar said, in order of stamps."""
         pings = sorted(self._pings, key=lambda ping: ping[0])
         return PingSample(
-            self._seconds([stamp_ns for stamp_ns, _ in pings]),
+            self.seconds([stamp_ns for stamp_ns, _ in pings]),
             tuple(points for _, points in pings),
             self._T_base_sonar,
         )
 
-    def _seconds(self, stamps_ns: list[int]) -> FloatArray:
-        seconds = (np.array(stamps_ns, dtype=np.int64) - self.start_ns) * 1e-9
+    @property
+    def is_turning(self) -> bool:
+        """Whether single beams came."""
+        return bool(self._beams)
+
+    def beams(self) -> BeamSample:
+        """Echoes of a sonar that turns, in the order of time: beams, or turns of one moment."""
+        gatherer, mount = BeamGatherer(), self._T_base_sonar
+        for beams, T_base_sonar, projection in sorted(
+            self._beams, key=lambda item: int(item[0].stamp_ns[0])
+        ):
+            gatherer.add(beams, T_base_sonar, projection)
+            mount = T_base_sonar
+        stamps, polar = [np.empty(0, np.int64)], [np.empty((0, 2))]
+        for sweep in gatherer.take(None):
+            found = sweep.echoes(self._sonar)
+            stamps.append(sweep.stamp_ns[found.beam])
+            polar.append(np.column_stack([sweep.bearing_rad[found.beam], found.range_m]))
+        if not self._beams:
+            for stamp_ns, points in sorted(self._pings, key=lambda ping: ping[0]):
+                stamps.append(np.full(len(points), stamp_ns, np.int64))
+                bearing = np.arctan2(points[:, 1], points[:, 0])
+                polar.append(np.column_stack([bearing, np.hypot(points[:, 0], points[:, 1])]))
+        bearing, range_m = np.vstack(polar).T
+        return BeamSample(self.seconds(np.concatenate(stamps)), bearing, range_m, mount)
+
+    def seconds(self, stamps_ns: ArrayLike) -> FloatArray:
+        """Stamps [ns] as times from the first reading [s]."""
+        seconds = (np.asarray(stamps_ns, dtype=np.int64) - self.start_ns) * 1e-9
         return np.asarray(seconds, dtype=np.float64)
 
 

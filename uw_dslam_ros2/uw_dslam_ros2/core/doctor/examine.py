@@ -56,6 +56,7 @@ class Examination:
     findings: list[Finding] = field(default_factory=list)
     conventions: Conventions = field(default_factory=Conventions)
     num_ping_motions: int = 0
+    num_turning_windows: int = 0
     mended: set[str] = field(default_factory=set)
     """Kinds of findings that the conventions mend."""
 

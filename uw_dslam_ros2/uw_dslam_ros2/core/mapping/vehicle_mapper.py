@@ -30,7 +30,7 @@ from uw_dslam_ros2.core.sonar import (
     detections_from_scan,
     place_sweep,
 )
-from uw_dslam_ros2.core.sonar.turning import Sweep, beams_of_image
+from uw_dslam_ros2.core.sonar.turning import Sweep, beams_of_image, is_few_beams
 from uw_dslam_ros2.core.submap import Submap
 
 __all__ = ["VehicleMapper"]
@@ -44,8 +44,6 @@ _TURN_MEMORY_S = 120.0
 """A turn takes up to 35 s, and its message may come when the next one is complete."""
 _AHEAD_NS = 1_000_000_000
 """At the end, beams this much newer than all navigation are placed by its last velocity."""
-_MIN_FAN_BEAMS = 5
-"""Fewer beams in an image are a piece of what a sonar that turns sees."""
 _MIN_OVERLAP = 0.3
 """Least share of a ping's echoes that must meet known ones for a match to be believed."""
 
@@ -149,7 +147,7 @@ class VehicleMapper:
         ``projection`` (2, 2) takes points of a fan that is not level to the plane, before
         ``T_base_sonar``: see `core.mounting.FanMount`.
         """
-        if len(image.bearing_rad) < _MIN_FAN_BEAMS:
+        if is_few_beams(image):
             return self.add_beams(beams_of_image(image), T_base_sonar, projection)
         return self._add(detect(image, self._config.sonar), T_base_sonar, projection)
 

@@ -33,6 +33,7 @@ __all__ = [
     "Slice",
     "Sweep",
     "beams_of_image",
+    "is_few_beams",
     "place_sweep",
 ]
 
@@ -85,6 +86,15 @@ class Beams:
                 )
         if self.range_m.shape != expected:
             raise InvalidInputError(f"range_m has shape {self.range_m.shape}, expected {expected}")
+
+
+_MIN_FAN_BEAMS = 5
+"""Fewer beams in an image are a piece of what a sonar that turns sees."""
+
+
+def is_few_beams(image: SonarImage) -> bool:
+    """Whether an image is only a piece of a turn."""
+    return len(image.bearing_rad) < _MIN_FAN_BEAMS
 
 
 def beams_of_image(image: SonarImage) -> Beams:

@@ -1,0 +1,120 @@
+"""The zero, the direction and the heading's delay of a sonar that turns, found by its echoes."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.doctor import Examination, NavigationSample
+from uw_dslam_ros2.core.doctor.turning import BeamSample
+from uw_dslam_ros2.core.doctor.turning_verdict import choose_spans, examine_turning
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.sim.instruments import InstrumentConfig
+from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, MissionConfig, plan_mission
+from uw_dslam_ros2.sim.turning import TurningSonarConfig, beam_bearing_rad, counted_rad
+from uw_dslam_ros2.sim.vehicle import DriveConfig
+
+TURN = TurningSonarConfig(turn_s=14.0, num_beams=120, max_range_m=40.0)
+SLOW = DriveConfig(speed_m_s=0.4, max_yaw_rate_rad_s=0.15, current_m_s=0.05)
+
+
+def recording(seed, turning=TURN, delay_s=0.0, duration_s=700.0):
+    """What the sonar, the DVL and an IMU of a slow vehicle in a basin say; times from 0 s."""
+    config = MissionConfig(
+        seed=seed,
+        num_vehicles=1,
+        duration_s=duration_s,
+        sonar_kind="turning",
+        turning=turning,
+        drive=SLOW,
+        instruments=InstrumentConfig(imu_rate_hz=10.0, dvl_rate_hz=2.0, imu_delay_s=delay_s),
+    )
+    mission = plan_mission(config)
+    run, rng = mission.runs[0], np.random.default_rng(seed)
+    rows = []
+    for i, stamp_ns in enumerate(run.ping_motion.stamp_ns):
+        bearing = beam_bearing_rad(turning, i)
+        sonar = run.ping_motion.pose(i) @ T_BASE_SONAR
+        ray = mission.world.cast((sonar.x, sonar.y), [sonar.yaw + bearing], 40.0).range_m[0]
+        if math.isfinite(ray):
+            rows.append((stamp_ns, counted_rad(turning, bearing), ray + rng.normal(0.0, 0.1)))
+    start_ns, log = run.motion.stamp_ns[0], run.navigation
+
+    def seconds(stamps):
+        return (np.array([int(s) for s in stamps], np.int64) - start_ns) * 1e-9
+
+    has_lock = np.isfinite(log.dvl_velocity_m_s).all(axis=1)
+    navigation = NavigationSample(
+        seconds(log.imu_stamp_ns),
+        log.yaw_rad,
+        log.yaw_rate_rad_s,
+        seconds(log.dvl_stamp_ns[has_lock]),
+        log.dvl_velocity_m_s[has_lock],
+        (T_BASE_DVL.x, T_BASE_DVL.y),
+    )
+    stamps, bearing, range_m = zip(*rows, strict=True)
+    beams = BeamSample(
+        seconds(stamps), np.array(bearing), np.array(range_m), SE2(T_BASE_SONAR.x, T_BASE_SONAR.y)
+    )
+    return navigation, beams
+
+
+def examined(navigation, beams):
+    found = Examination()
+    spans = choose_spans(navigation, beams.stamp_s)
+    examine_turning(found, navigation, beams, spans, "auv_1")
+    return found
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_nothing_is_said_of_a_recording_as_it_should_be(seed):
+    found = examined(*recording(seed))
+    assert found.num_turning_windows >= 4
+    assert found.findings == []
+    assert found.conventions == Conventions()
+
+
+@pytest.mark.parametrize(("zero_deg", "seed"), [(94.0, 1), (-30.0, 2), (180.0, 3)])
+def test_zero_direction_and_delay_are_found_together(zero_deg, seed):
+    turning = replace(TURN, zero_rad=math.radians(zero_deg), is_clockwise=True)
+    found = examined(*recording(seed, turning, delay_s=0.8))
+    kinds = [finding.kind for finding in found.findings]
+    assert kinds == ["sonar_mirrored", "sonar_turned", "imu_delay"]
+    conventions = found.conventions
+    assert conventions.sonar_is_mirrored
+    # A bearing b, mirrored and turned, is what it means.
+    off = conventions.sonar_yaw_offset_rad - turning.zero_rad
+    assert abs(math.remainder(off, 2.0 * math.pi)) < math.radians(2.5)
+    assert conventions.imu_delay_s == pytest.approx(0.8, abs=0.2)
+
+
+def test_the_zero_alone_is_found():
+    turning = replace(TURN, zero_rad=math.radians(-60.0))
+    found = examined(*recording(4, turning))
+    assert [finding.kind for finding in found.findings] == ["sonar_turned"]
+    assert found.conventions.sonar_yaw_offset_rad == pytest.approx(turning.zero_rad, abs=0.04)
+
+
+def test_a_velocity_of_the_bottom_is_not_taken_for_a_turned_sonar():
+    navigation, beams = recording(5)
+    navigation = replace(navigation, velocity_m_s=-navigation.velocity_m_s)
+    found = examined(navigation, beams)
+    assert [finding.kind for finding in found.findings] == ["dvl_sign"]
+
+
+@pytest.mark.parametrize("reason", ["stands", "short", "no heading"])
+def test_where_turns_cannot_be_compared_nothing_is_said(reason):
+    navigation, beams = recording(1)
+    if reason == "stands":
+        navigation = replace(navigation, velocity_m_s=0.0 * navigation.velocity_m_s)
+    elif reason == "short":
+        early = beams.stamp_s < 40.0
+        beams = BeamSample(beams.stamp_s[early], beams.bearing_rad[early], beams.range_m[early])
+    else:
+        nothing = np.full(len(navigation.imu_s), np.nan)
+        navigation = replace(navigation, yaw_rad=nothing, yaw_rate_rad_s=nothing)
+    found = examined(navigation, beams)
+    assert found.num_turning_windows == 0
+    assert found.findings == []

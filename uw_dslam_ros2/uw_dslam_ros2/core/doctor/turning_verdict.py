@@ -1,0 +1,205 @@
+"""What the beams of a sonar that turns say of the recording's conventions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.doctor.examine import Examination
+from uw_dslam_ros2.core.doctor.imu import compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.sample import NavigationSample
+from uw_dslam_ros2.core.doctor.turning import (
+    BeamSample,
+    TurningFit,
+    TurningTrial,
+    choose_windows,
+)
+from uw_dslam_ros2.core.findings import Finding
+
+__all__ = ["choose_spans", "examine_turning"]
+
+FloatArray = NDArray[np.float64]
+
+_SURE = 0.99
+_SHARED = 1.5
+"""Windows overlap by half, so that so many of them count as one."""
+_MIN_OFFSET_RAD, _SIGMAS = math.radians(4.0), 4.0
+_MIN_DELAY_S = 0.15
+
+
+def examine_turning(
+    result: Examination,
+    navigation: NavigationSample,
+    beams: BeamSample,
+    spans: Sequence[tuple[float, float]],
+    vehicle_id: str = "",
+) -> None:
+    """Add to an examination what the beams (N,) say: direction, zero, and the heading's delay.
+
+    Nothing is added where too few turns can be compared, or no reading of them is clearly best.
+    """
+    yaw = _yaw_of(result, navigation)
+    if yaw is None:
+        return
+    trial = TurningTrial(beams, navigation, yaw, spans)
+    result.num_turning_windows = trial.num_windows
+    if trial.num_windows:
+        _Judge(result, trial, navigation, vehicle_id).run()
+
+
+def choose_spans(navigation: NavigationSample, ping_s: FloatArray) -> list[tuple[float, float]]:
+    """Parts [s] of a recording with pings (P,) that show most."""
+    imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
+    yaw = imu.by_rates if imu.by_orientation is None else imu.by_orientation
+    if yaw is None or len(ping_s) == 0:
+        return []
+    return choose_windows(float(ping_s[0]), float(ping_s[-1]), navigation.imu_s, yaw)
+
+
+def _yaw_of(result: Examination, navigation: NavigationSample) -> FloatArray | None:
+    """Yaw (K,) by orientation, which does not drift, or by rates where it says nothing."""
+    imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
+    if imu.by_orientation is not None and result.conventions.imu_orientation != "none":
+        return imu.by_orientation
+    if imu.by_rates is None:
+        return None
+    return imu.by_rates * (math.pi / 180.0 if result.conventions.imu_rates_in_degrees else 1.0)
+
+
+def confidence_of(better: TurningFit, worse: TurningFit) -> float:
+    """How sure it is that the better one's lead over windows is no chance, 0 to 1."""
+    lead = better.score - worse.score
+    count = len(lead) / _SHARED
+    if count < 2.0:
+        return 0.5
+    sigma = float(np.std(lead, ddof=1)) / math.sqrt(count)
+    return _probability(float(lead.mean()) / max(sigma, 1e-9))
+
+
+def _probability(deviations: float) -> float:
+    return 0.5 + 0.5 * math.erf(deviations / math.sqrt(2.0))
+
+
+class _Judge:
+    def __init__(
+        self,
+        result: Examination,
+        trial: TurningTrial,
+        navigation: NavigationSample,
+        vehicle_id: str,
+    ) -> None:
+        self._result, self._trial = result, trial
+        self._velocity_m_s = navigation.velocity_m_s
+        self._vehicle_id = vehicle_id
+
+    def run(self) -> None:
+        best, other = sorted((self._trial.best(1), self._trial.best(-1)), key=lambda f: -f.mean)
+        if best.reading.side < 0 and confidence_of(best, other) < _SURE:
+            best = other  # what is usual stays until it is clearly wrong
+        if best.reading.side < 0:
+            self._judge_side(best, other)
+        self._judge_offset(best)
+        self._judge_delay(best)
+
+    def _add(
+        self, kind: str, role: str, detail: str, confidence: float, **changes: str | float | bool
+    ) -> None:
+        finding = Finding(kind, role, detail, confidence, vehicle_id=self._vehicle_id)
+        self._result.add(finding, **changes)
+
+    def _judge_side(self, best: TurningFit, other: TurningFit) -> None:
+        """Turns run backwards, or it is the heading that does: the sideways velocity tells."""
+        sure = confidence_of(best, other)
+        reading = best.reading
+        seen = replace(reading, side=1, heading=-1, offset_rad=-reading.offset_rad)
+        by_heading = self._trial.refined(seen)
+        if confidence_of(by_heading, best) > _SURE:
+            self._add(
+                "imu_ned",
+                "imu",
+                "it turns against the sonar's turns, which agree with one another and with the "
+                "sideways velocity if its yaw grows clockwise (conventions.imu_orientation: ned, "
+                "conventions.imu_rates: frd)",
+                confidence_of(by_heading, best),
+                imu_orientation="ned",
+                imu_rates="frd",
+            )
+            return
+        doubt = confidence_of(best, by_heading) < _SURE
+        self._add(
+            "sonar_mirrored",
+            "sonar",
+            "its turns meet one another only if they run the other way: its angles grow clockwise "
+            "(conventions.sonar_is_mirrored: true)"
+            + (
+                "; an imu that speaks ned would look alike here, so make sure that the map is not "
+                "a mirror image"
+                if doubt
+                else ""
+            ),
+            sure,
+            sonar_is_mirrored=True,
+        )
+
+    def _judge_offset(self, best: TurningFit) -> None:
+        offset = math.remainder(best.reading.offset_rad, 2.0 * math.pi)
+        sigma = self._trial.offset_sigma_rad(best)
+        if abs(offset) < max(_MIN_OFFSET_RAD, _SIGMAS * sigma):
+            return
+        usual = self._trial.score(replace(best.reading, offset_rad=0.0))
+        sure = confidence_of(best, usual)
+        if sure < _SURE:
+            return
+        degrees = math.degrees(offset)
+        mean = complex(*np.median(self._velocity_m_s, axis=0))
+        # A vehicle goes ahead more often than not: who says so is right.
+        by_velocity = abs(np.angle(mean)) + 0.05
+        by_echoes = abs(np.angle(mean * np.exp(-1j * offset)))
+        if by_echoes > by_velocity:
+            self._add(
+                "sonar_turned",
+                "sonar",
+                f"its turns meet one another only if its zero is {degrees:.0f} degrees from where "
+                "tf says, counter-clockwise (conventions.sonar_yaw_offset_rad: "
+                f"{offset:.3f})",
+                sure,
+                sonar_yaw_offset_rad=round(offset, 4),
+            )
+        elif abs(abs(degrees) - 180.0) < 15.0:
+            self._add(
+                "dvl_sign",
+                "velocity",
+                "its velocity has the wrong sign: it is the bottom's against the vehicle "
+                "(conventions.velocity_yaw_offset_rad: 3.1416)",
+                sure,
+                velocity_yaw_offset_rad=round(math.pi, 4),
+            )
+        else:
+            self._add(
+                "dvl_turned",
+                "velocity",
+                f"its velocity is {degrees:.0f} degrees off the sonar's motion: it is mounted "
+                f"turned (conventions.velocity_yaw_offset_rad: {-offset:.3f})",
+                sure,
+                velocity_yaw_offset_rad=round(-offset, 4),
+            )
+
+    def _judge_delay(self, best: TurningFit) -> None:
+        delay_s = best.reading.delay_s
+        still = self._trial.score(replace(best.reading, delay_s=0.0))
+        sure = confidence_of(best, still)
+        if abs(delay_s) < _MIN_DELAY_S or sure < _SURE:
+            return
+        way = "later" if delay_s > 0.0 else "earlier"
+        self._add(
+            "imu_delay",
+            "imu",
+            f"its stamps are {abs(delay_s):.2f} s {way} than the sonar's, by where the walls lie "
+            f"while the vehicle turns (conventions.imu_delay_s: {delay_s:.2f})",
+            sure,
+            imu_delay_s=round(delay_s, 3),
+        )
