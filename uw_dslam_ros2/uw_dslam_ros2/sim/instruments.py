@@ -71,6 +71,12 @@ class InstrumentConfig(Config):
     depth_rate_hz: float = setting(5.0, 0.5, 50.0, "pressure messages per second")
     depth_noise_m: float = setting(0.01, 0.0, 1.0, "white noise of the depth [m]")
 
+    @property
+    def yaw_variance(self) -> float:
+        """What a driver would claim: it does not know of steel or of drift."""
+        offset = self.compass_offset_rad if self.heading_source == "compass" else 0.0
+        return float(self.yaw_noise_rad**2 + offset**2)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NavigationLog:

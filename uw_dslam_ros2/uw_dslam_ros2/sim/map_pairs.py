@@ -64,7 +64,12 @@ NOISES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPair:
-    """Two maps; ``T_target_source`` is None where they do not show the same place."""
+    """Two maps; ``T_target_source`` is None where they do not show the same place.
+
+    ``middle_m`` (2,) is the point of the source's frame at which an answer's error is measured,
+    the map's middle where None. An answer that is off by less than ``tolerance_m`` and
+    ``tolerance_rad`` is right.
+    """
 
     kind: str
     noise: str
@@ -73,6 +78,9 @@ class MapPair:
     target: OccupancyMap
     T_target_source: SE2 | None
     is_ambiguous: bool = False
+    middle_m: tuple[float, float] | None = None
+    tolerance_m: float | None = None  # six of the source's cells where None
+    tolerance_rad: float = _RIGHT_RAD
 
 
 @njit(cache=True, nogil=True)
@@ -345,15 +353,16 @@ def _windows_at_an_end(
 
 
 def pair_errors(pair: MapPair, T_target_source: SE2 | None) -> tuple[float, float]:
-    """Errors at the source map's middle [m], in rotation [rad]; infinite without truth or pose."""
+    """Errors at the pair's middle [m], in rotation [rad]; infinite without truth or pose."""
     if pair.T_target_source is None or T_target_source is None:
         return math.inf, math.inf
-    middle = pair.source.spec.corners().mean(axis=0)
+    middle = np.array(pair.middle_m or pair.source.spec.corners().mean(axis=0))
     offset = T_target_source.apply(middle) - pair.T_target_source.apply(middle)
     return float(np.hypot(*offset)), T_target_source.distance_to(pair.T_target_source)[1]
 
 
 def is_right(pair: MapPair, T_target_source: SE2 | None) -> bool:
-    """Within 2 degrees and six cells, 0.30 m at 0.05 m."""
+    """Within the pair's tolerances: if it has none, 2 degrees and 0.30 m at 0.05 m a cell."""
     error_m, error_rad = pair_errors(pair, T_target_source)
-    return error_rad < _RIGHT_RAD and error_m < _RIGHT_CELLS * pair.source.spec.resolution_m
+    tolerance_m = pair.tolerance_m or _RIGHT_CELLS * pair.source.spec.resolution_m
+    return error_rad < pair.tolerance_rad and error_m < tolerance_m

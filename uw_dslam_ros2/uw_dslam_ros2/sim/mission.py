@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,10 +143,17 @@ class Mission:
     runs: tuple[VehicleRun, ...]
 
 
-def plan_mission(config: MissionConfig) -> Mission:
-    """Build the place, send the vehicles through it, and sample their instruments."""
-    world = make_place(config.place, config.seed, config.num_vehicles, config.place_width_m)
-    areas = split_areas(world, config.num_vehicles, config.overlap)
+def plan_mission(
+    config: MissionConfig, world: World | None = None, areas: Sequence[SurveyArea] | None = None
+) -> Mission:
+    """Build the place, send the vehicles through it, and sample their instruments.
+
+    Another place than the configuration's, and areas for the vehicles, may be given.
+    """
+    if world is None:
+        world = make_place(config.place, config.seed, config.num_vehicles, config.place_width_m)
+    if areas is None:
+        areas = split_areas(world, config.num_vehicles, config.overlap)
     runs = [_run(config, world, area, index) for index, area in enumerate(areas)]
     return Mission(config, world, tuple(runs))
 

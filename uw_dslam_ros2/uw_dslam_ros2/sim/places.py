@@ -1,17 +1,25 @@
-"""Places to simulate, a different one for every seed: a harbour, and an open lake bed."""
+"""Places to simulate, a different one for every seed: harbours, lake beds, and hard ones."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.sim.world import Surface, World, WorldBuilder
+from uw_dslam_ros2.sim.world import Surface, World, WorldBuilder, bounds_of
 
-__all__ = ["PLACES", "make_harbour", "make_lake", "make_place"]
+__all__ = [
+    "PLACES",
+    "make_canal",
+    "make_harbour",
+    "make_lake",
+    "make_place",
+    "make_symmetric",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -35,8 +43,11 @@ def make_place(place: str, seed: int, num_vehicles: int = 3, width_m: float = 0.
     raise InvalidInputError(f"place is {place!r}, expected one of {', '.join(PLACES)}")
 
 
-def make_harbour(seed: int, num_vehicles: int = 3, width_m: float = 0.0) -> World:
-    """Build a basin of quay walls with piers, piles, a moored hull, rocks and a breakwater."""
+def make_harbour(seed: int, num_vehicles: int = 3, width_m: float = 0.0, twin: int = 0) -> World:
+    """Build a basin of quay walls with piers, piles, a moored hull, rocks and a breakwater.
+
+    Twins are basins of one outline, as if built by one plan; all else is each one's own.
+    """
     rng = np.random.default_rng([seed, 1])
     width = (width_m or 40.0 + 35.0 * num_vehicles) + rng.uniform(-5.0, 5.0)
     num_things = max(1, round((width - 40.0) / 35.0))
@@ -52,6 +63,8 @@ def make_harbour(seed: int, num_vehicles: int = 3, width_m: float = 0.0) -> Worl
             np.column_stack([width - east[1:, 1], east[1:, 0]]),
         ]
     )
+    if twin:
+        rng = np.random.default_rng([seed, 1, twin])
     _add_quay(builder, rng, outline)
     _add_breakwater(builder, rng, width, height)
     slots = _slots(rng, width, num_things)
@@ -63,6 +76,43 @@ def make_harbour(seed: int, num_vehicles: int = 3, width_m: float = 0.0) -> Worl
         _add_rock(builder, rng, (x, rng.uniform(0.3, 0.95) * height), rng.uniform(0.4, 1.8))
     water_point = (0.5 * width, 0.6 * height)
     return builder.build("harbour", seed, water_point, 8.0)
+
+
+def make_canal(seed: int, length_m: float = 120.0) -> World:
+    """Build two long straight quays with a closed end: little tells where along it one is."""
+    rng = np.random.default_rng([seed, 5])
+    breadth = rng.uniform(24.0, 36.0)
+    builder = WorldBuilder()
+    _add_quay(builder, rng, np.array([(0.0, breadth), (0.0, 0.0), (length_m, 0.0)]))
+    _add_quay(builder, rng, np.array([(length_m, breadth), (0.0, breadth)]))
+    for x in rng.uniform(5.0, length_m - 5.0, size=max(1, round(length_m / 40.0))):
+        is_south = rng.random() < 0.5
+        _add_dolphin(builder, rng, (float(x), 2.0 if is_south else breadth - 2.0))
+    return builder.build("canal", seed, (0.5 * length_m, 0.5 * breadth), 8.0)
+
+
+def make_symmetric(seed: int, width_m: float = 90.0) -> World:
+    """Build a closed basin that is itself again after half a turn, to the last fender."""
+    rng = np.random.default_rng([seed, 6])
+    height = rng.uniform(50.0, 65.0)
+    builder = WorldBuilder()
+    west, south = _jagged_side(rng, height), _jagged_side(rng, width_m)
+    west = np.column_stack([west[::-1, 1], height - west[::-1, 0]])[::-1]
+    _add_quay(builder, rng, np.vstack([west, south[1:]]))
+    for i, x in enumerate(rng.uniform(12.0, width_m - 12.0, 3)):
+        (_add_pier, _add_piled_jetty, _add_hull)[i](builder, rng, x)
+    for _ in range(3):
+        spot = rng.uniform((10.0, 10.0), (width_m - 10.0, 0.5 * height))
+        _add_rock(builder, rng, (float(spot[0]), float(spot[1])), rng.uniform(0.4, 1.8))
+    half = builder.build("symmetric", seed, (0.5 * width_m, 0.5 * height), 8.0)
+    turned = np.tile([width_m, height], 2) - half.segments
+    segments = np.vstack([half.segments, turned])
+    return replace(
+        half,
+        segments=segments,
+        surface_of=np.tile(half.surface_of, 2),
+        bounds=bounds_of(segments),
+    )
 
 
 def _jagged_side(rng: np.random.Generator, length: float) -> FloatArray:

@@ -163,18 +163,11 @@ class VehicleRecorder:
             stamp_ns,
             f"{self._run.vehicle_id}/imu",
             float(log.yaw_rad[index]),
-            self._yaw_variance(),
+            instruments.yaw_variance,
             float(log.yaw_rate_rad_s[index]),
             instruments.gyro_noise_rad_s**2,
         )
         self._writer.write(f"/{self._run.vehicle_id}/imu", stamp_ns, message)
-
-    def _yaw_variance(self) -> float:
-        """What a driver would claim: it does not know of steel or of drift."""
-        instruments = self._config.instruments
-        is_compass = instruments.heading_source == "compass"
-        offset = instruments.compass_offset_rad if is_compass else 0.0
-        return float(instruments.yaw_noise_rad**2 + offset**2)
 
     def _write_dvl(self, stamp_ns: int, index: int) -> None:
         velocity = self._run.navigation.dvl_velocity_m_s[index]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 
-__all__ = ["NO_HIT", "RayHits", "Surface", "World", "WorldBuilder", "cast_rays"]
+__all__ = ["NO_HIT", "RayHits", "Surface", "World", "WorldBuilder", "bounds_of", "cast_rays"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -146,6 +146,12 @@ def cast_rays(
     return hits
 
 
+def bounds_of(segments: FloatArray) -> tuple[float, float, float, float]:
+    """Smallest box [x_min, y_min, x_max, y_max] around segments (S, 4)."""
+    xs, ys = segments[:, [0, 2]], segments[:, [1, 3]]
+    return float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max())
+
+
 class WorldBuilder:
     """Collects outlines of one place."""
 
@@ -171,14 +177,13 @@ class WorldBuilder:
     ) -> World:
         """Finish; the bounds are those of the outlines."""
         segments = np.array(self._segments)
-        xs, ys = segments[:, [0, 2]], segments[:, [1, 3]]
         return World(
             name=name,
             seed=seed,
             segments=segments,
             surface_of=np.array(self._surface_of, dtype=np.int64),
             surfaces=tuple(self._surfaces),
-            bounds=(float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max())),
+            bounds=bounds_of(segments),
             water_point=(float(water_point[0]), float(water_point[1])),
             water_depth_m=water_depth_m,
         )

@@ -20,7 +20,9 @@ from uw_dslam_ros2.sim.mission import MissionConfig
 from uw_dslam_ros2.sim.recording import simulate_mission
 from uw_dslam_ros2.sim.sonar import SonarConfig
 
-__all__ = ["FleetMission", "mapped_bags", "simulated_mission"]
+__all__ = ["FleetMission", "code_digest", "mapped_bags", "simulated_mission"]
+
+_PARTS = ("sim", "core/sonar", "core/navigation", "core/mapping", "core/registration")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +51,7 @@ def simulated_mission(
         sonar=SonarConfig(num_beams=128, num_ranges=250),
     )
     name = f"{place}_{seed}"
-    folder = cache / f"{name}_{_digest(repr(config.to_dict()))}"
+    folder = cache / f"{name}_{code_digest(repr(config.to_dict()), *_PARTS)}"
     if not (folder / "done").exists():
         with TemporaryDirectory() as work:
             mission = simulate_mission(Path(work) / "mission", config)
@@ -85,11 +87,11 @@ def _store(folder: Path, mission: FleetMission) -> None:
     (folder / "done").touch()
 
 
-def _digest(configuration: str) -> str:
-    """Of the configuration and of all code that simulates and maps."""
+def code_digest(configuration: str, *parts: str) -> str:
+    """Of a configuration and of all code in some folders of the package."""
     root = Path(uw_dslam_ros2.__file__).parent
     hasher = hashlib.blake2b(configuration.encode(), digest_size=6)
-    for part in ("sim", "core/sonar", "core/navigation", "core/mapping", "core/registration"):
+    for part in parts:
         for path in sorted((root / part).rglob("*.py")):
             hasher.update(path.read_bytes())
     return hasher.hexdigest()
