@@ -14,6 +14,7 @@ import numpy as np
 from harness import Timing, emit, require, run_cases, timed
 
 from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.sim.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
 
 _MAX_RMSE_M = 0.5  # one cell
@@ -52,7 +53,7 @@ def incremental(quick: bool) -> None:
     fleet = lawnmower_fleet(size, size, 0)
     matcher, queue = KnowingMatcher(fleet), MapQueue()
     drawing, settling, searches, ending = Timing(), Timing(), [], Timing()
-    for submap_id in sorted(fleet.submaps, key=lambda i: (i[1], i[0])):
+    for submap_id in sorted(fleet.submaps, key=lambda i: (i.sequence, i.vehicle_id)):
         queue.is_growing = True
         timed(lambda i=submap_id: _add_and_draw(queue, fleet, i), drawing)
         searches.append(timed(lambda: answer_all(queue, matcher), settling))
@@ -104,7 +105,7 @@ def _check(fleet: Fleet, queue: MapQueue) -> None:
     require(queue.global_map() is not None, "no map")
 
 
-def _add_and_draw(queue: MapQueue, fleet: Fleet, submap_id: tuple[str, int]) -> None:
+def _add_and_draw(queue: MapQueue, fleet: Fleet, submap_id: SubmapId) -> None:
     queue.add_submap(fleet.submaps[submap_id])
     queue.changed_window()
 

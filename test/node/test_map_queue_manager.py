@@ -345,7 +345,7 @@ def test_provenance_is_saved_with_the_map(manage, tmp_path):
     archive = str(tmp_path / "map_provenance.npz")
     assert archive in saved.files
     provenance = read_provenance(archive)
-    assert provenance.contributors == ((), (("auv_1", 0),))
+    assert provenance.contributors == ((), (("auv_1", 0, 0),))
 
 
 def test_changed_part_goes_out_as_an_update(manage):

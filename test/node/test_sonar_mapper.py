@@ -161,7 +161,8 @@ def test_room_becomes_map_submap_odometry_and_frames(ros_context, spinning):
         last_ns = START_NS + 9_900_000_000
         until(lambda: stamp_of(vehicle.odometry[-1]) == last_ns, "the last odometry")
     submap = submap_from_msg(vehicle.submaps[-1])
-    assert submap.submap_id == ("auv_1", 0)
+    assert (submap.vehicle_id, submap.sequence) == ("auv_1", 0)
+    assert submap.run_id > 0
     assert submap.is_final
     assert vehicle.submaps[-1].header.frame_id == "auv_1/submap_0"
     assert vehicle.maps[-1].header.frame_id == "auv_1/map"

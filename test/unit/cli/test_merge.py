@@ -29,7 +29,9 @@ T_WORLD_MAP = {
 
 # An answer with all its numbers; who asks does not matter.
 TEMPLATE = missions.answer(
-    MatchRequest(0, missions.room(), missions.room(), None, (), (), ("auv_2", 0), ("auv_1", 0))
+    MatchRequest(
+        0, missions.room(), missions.room(), None, (), (), ("auv_2", 0, 0), ("auv_1", 0, 0)
+    )
 )
 
 
@@ -134,7 +136,7 @@ def test_all_maps_are_drawn_into_the_frame_of_the_first(files, plant, tmp_path, 
         assert float(row["sigma_m"]) == pytest.approx(0.01)
     provenance = read_provenance(out / "merged_provenance.npz")
     assert provenance.spec == merged.spec
-    assert (("a", 0), ("b", 0), ("c", 0)) in provenance.contributors
+    assert (("a", 0, 0), ("b", 0, 0), ("c", 0, 0)) in provenance.contributors
     assert (out / "picture.png").read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr().out
     assert "joined: a, b, c: " in said

@@ -19,6 +19,7 @@ from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.session import load_session, save_session
 from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
@@ -125,5 +126,6 @@ def test_an_empty_queue_has_an_empty_outcome(tmp_path: Path) -> None:
 
 
 def test_names_of_submaps_are_short() -> None:
-    ids = [("b", 3), ("a", 0), ("a", 1), ("a", 2), ("a", 5)]
-    assert names_of(ids) == "a/0-2,5 + b/3"
+    numbers = [("b", 1, 3), ("a", 1, 0), ("a", 1, 1), ("a", 1, 2), ("a", 1, 5), ("a", 2, 0)]
+    ids = [SubmapId(*number) for number in numbers]
+    assert names_of(ids) == "a/0-2,5 + a#2/0 + b/3"

@@ -55,9 +55,9 @@ def test_provenance_does_not_depend_on_the_order_and_counts_dissent():
 
 def test_a_withdrawn_submap_is_named_no_more():
     queue = settled()
-    queue.withdraw(("auv_2", 1))
+    queue.withdraw(("auv_2", 0, 1))
     named = {i for ids in queue.provenance().contributors for i in ids}
-    assert named == set(FLEET.submaps) - {("auv_2", 1)}
+    assert named == set(FLEET.submaps) - {("auv_2", 0, 1)}
 
 
 def test_what_is_written_is_read_again(tmp_path):

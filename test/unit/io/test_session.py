@@ -45,7 +45,7 @@ def test_a_saved_queue_comes_back_as_it_was(tmp_path):
     oracle = KnowingMatcher(FLEET)
     for request in queue.next_requests(2):
         queue.add_result(request.request_id, oracle(request))
-    queue.withdraw(("auv_3", 2))
+    queue.withdraw(("auv_3", 0, 2))
     save_session(tmp_path / "new" / "session", queue)
     again = load_session(tmp_path / "new" / "session")
     assert summary(again) == summary(queue)
@@ -56,7 +56,7 @@ def test_a_saved_queue_comes_back_as_it_was(tmp_path):
     answer_all(again, oracle)
     assert summary(again) == summary(queue)
     states = {r.submap.submap_id: r.state for r in again.submaps()}
-    assert states["auv_3", 2] is SubmapState.WITHDRAWN
+    assert states["auv_3", 0, 2] is SubmapState.WITHDRAWN
 
 
 def test_saving_again_writes_only_what_is_new(tmp_path):
@@ -96,7 +96,7 @@ def test_a_failure_at_any_step_leaves_the_old_session_whole(tmp_path, monkeypatc
     save_session(tmp_path, old)
     new = filled()
     answer_all(new, KnowingMatcher(FLEET))
-    new.withdraw(("auv_1", 1))
+    new.withdraw(("auv_1", 0, 1))
     before, after = contents(old), contents(new)
     assert before != after
     real = sqlite3.connect
@@ -133,11 +133,11 @@ queue = MapQueue()
 for submap_id in sorted(fleet.submaps):
     queue.add_submap(fleet.submaps[submap_id])
     save_session(sys.argv[1], queue)
-    print(f"{submap_id[0]} {submap_id[1]}", flush=True)
+    print(*submap_id, flush=True)
 while True:
-    queue.withdraw(("auv_1", 1))
+    queue.withdraw(("auv_1", 0, 1))
     save_session(sys.argv[1], queue)
-    queue.restore(("auv_1", 1))
+    queue.restore(("auv_1", 0, 1))
     save_session(sys.argv[1], queue)
 """
 
@@ -154,8 +154,8 @@ def test_nothing_accepted_is_lost_by_kill_9(tmp_path, kill_after):
     )
     saved = []
     for line in process.stdout:
-        vehicle, sequence = line.split()
-        saved.append((vehicle, int(sequence)))
+        vehicle, *numbers = line.split()
+        saved.append((vehicle, *map(int, numbers)))
         if len(saved) == kill_after:
             break
     process.send_signal(signal.SIGKILL)

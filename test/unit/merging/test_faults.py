@@ -15,7 +15,7 @@ from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, refuse
 
 FLEET = three_vehicles()
 CONFIG = MapQueueConfig(anchor_vehicle="auv_1")
-ANCHOR = ("auv_1", 0)
+ANCHOR = ("auv_1", 0, 0)
 
 
 def calm_map() -> bytes:
@@ -111,7 +111,7 @@ def test_a_session_read_after_any_answer_goes_on_to_the_same_map(tmp_path):
 
 def noise(vehicle: str, sequence: int):
     """A submap in good order that shows nothing that is there."""
-    model = FLEET.submaps["auv_1", sequence]
+    model = FLEET.submaps["auv_1", 0, sequence]
     rng = np.random.default_rng([7, sequence])
     values = np.where(model.grid.known, rng.choice([0, 100], model.grid.values.shape), -1)
     grid = OccupancyMap(model.grid.spec, values.astype(np.int8))
@@ -130,9 +130,9 @@ def test_a_vehicle_that_sends_nonsense_stays_out():
     for submap_id in sorted(FLEET.submaps):
         queue.add_submap(FLEET.submaps[submap_id])
         if submap_id[0] == "auv_1":
-            queue.add_submap(noise("auv_0", submap_id[1]))
+            queue.add_submap(noise("auv_0", submap_id.sequence))
             bad = dataclasses.replace(
-                noise("auv_0", submap_id[1]), revision=1, covariance=np.full((3, 3), np.nan)
+                noise("auv_0", submap_id.sequence), revision=1, covariance=np.full((3, 3), np.nan)
             )
             with pytest.raises(InvalidInputError, match="auv_0/"):
                 queue.add_submap(bad)
@@ -148,7 +148,7 @@ def test_two_vehicles_of_one_name_are_told_and_the_first_one_stays():
     for submap_id in sorted(FLEET.submaps):
         queue.add_submap(FLEET.submaps[submap_id])
     for sequence in range(4):
-        impostor = dataclasses.replace(FLEET.submaps["auv_3", sequence], vehicle_id="auv_1")
+        impostor = dataclasses.replace(FLEET.submaps["auv_3", 0, sequence], vehicle_id="auv_1")
         with pytest.raises(InvalidInputError, match="two vehicles of this name"):
             queue.add_submap(impostor)
     answer_all(queue, KnowingMatcher(FLEET))
@@ -172,7 +172,7 @@ def test_clocks_that_are_apart_change_no_map(shift_s):
     answer_all(queue, KnowingMatcher(FLEET))
     assert map_bytes(queue) == calm_map()
     stamps_ns = queue.trajectories()["auv_2"][0]
-    assert stamps_ns[0] == FLEET.submaps["auv_2", 0].trajectory_stamp_ns[0] + shift_ns
+    assert stamps_ns[0] == FLEET.submaps["auv_2", 0, 0].trajectory_stamp_ns[0] + shift_ns
 
 
 def test_a_withdrawn_submap_of_a_killed_manager_stays_out():
@@ -180,13 +180,13 @@ def test_a_withdrawn_submap_of_a_killed_manager_stays_out():
     for submap_id in sorted(FLEET.submaps):
         queue.add_submap(FLEET.submaps[submap_id])
     answer_all(queue, KnowingMatcher(FLEET))
-    queue.withdraw(("auv_2", 1))
+    queue.withdraw(("auv_2", 0, 1))
     answer_all(queue, KnowingMatcher(FLEET))
     resumed = MapQueue.from_state(queue.to_state(), CONFIG)
-    resumed.add_submap(dataclasses.replace(FLEET.submaps["auv_2", 1], revision=9))
+    resumed.add_submap(dataclasses.replace(FLEET.submaps["auv_2", 0, 1], revision=9))
     answer_all(resumed, KnowingMatcher(FLEET))
     states = {r.submap.submap_id: r.state for r in resumed.submaps()}
-    assert states["auv_2", 1] is SubmapState.WITHDRAWN
+    assert states["auv_2", 0, 1] is SubmapState.WITHDRAWN
     assert SE2() == next(
         r.T_component_submap for r in resumed.submaps() if r.submap.submap_id == ANCHOR
     )

@@ -17,7 +17,9 @@ from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, lawnmower_fleet
 
 def in_turn(fleet):
     """Submaps as vehicles that set out together send them."""
-    return [fleet.submaps[i] for i in sorted(fleet.submaps, key=lambda i: (i[1], i[0]))]
+    return [
+        fleet.submaps[i] for i in sorted(fleet.submaps, key=lambda i: (i.sequence, i.vehicle_id))
+    ]
 
 
 def fed(fleet, matcher, *, is_growing):
@@ -78,7 +80,7 @@ def test_what_holds_goes_on_to_hold_and_moved_poses_ask_nothing():
 def test_a_repeat_is_told_from_a_new_submap():
     fleet = three_vehicles()
     queue = MapQueue()
-    submap = fleet.submaps["auv_1", 0]
+    submap = fleet.submaps["auv_1", 0, 0]
     assert queue.add_submap(submap)
     assert not queue.add_submap(submap)
     assert queue.add_submap(dataclasses.replace(submap, revision=2))

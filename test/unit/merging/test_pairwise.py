@@ -61,7 +61,7 @@ def test_a_withdrawn_vehicle_does_not_stop_the_others():
     queue = filled(["auv_1", "auv_2", "auv_3"])
     for submap_id in [i for i in FLEET.submaps if i[0] == "auv_3"]:
         queue.withdraw(submap_id)
-    queue.add_submap(dataclasses.replace(FLEET.submaps["auv_3", 0], revision=1))
+    queue.add_submap(dataclasses.replace(FLEET.submaps["auv_3", 0, 0], revision=1))
     answer_all(queue, KnowingMatcher(FLEET))
     components = {r.submap.vehicle_id: r.component for r in queue.submaps()}
     assert components == {"auv_1": 0, "auv_2": 0, "auv_3": 1}

@@ -72,7 +72,7 @@ def test_the_frame_goes_over_to_where_vehicles_are_joined_and_stays():
     answer_all(queue, all_but_the_first)
     assert set(queue.trajectories()) == {"auv_2", "auv_3"}
     assert queue.changed_window() is not None
-    first = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_2", 0))
+    first = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_2", 0, 0))
     assert (first.component, first.T_component_submap) == (0, SE2())
     again = MapQueue.from_state(queue.to_state())
     assert map_bytes(again) == map_bytes(queue)
@@ -80,7 +80,7 @@ def test_the_frame_goes_over_to_where_vehicles_are_joined_and_stays():
         if submap_id[0] == "auv_3":
             queue.withdraw(submap_id)
     answer_all(queue, all_but_the_first)
-    first = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_2", 0))
+    first = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_2", 0, 0))
     assert (first.component, first.T_component_submap) == (0, SE2())
     assert set(queue.trajectories()) == {"auv_2"}
 
@@ -96,9 +96,9 @@ def test_a_named_anchor_keeps_the_frame_alone():
 def test_any_order_of_arrival_gives_the_same_bytes(order, batch):
     """Submaps one by one, some answered in between, some twice; the frame is pinned by name."""
     config = MapQueueConfig(anchor_vehicle="auv_1")
-    straight = filled([i for i in IDS if i[1] == 0] + IDS, config)
+    straight = filled([i for i in IDS if i.sequence == 0] + IDS, config)
     answer_all(straight, KnowingMatcher(FLEET))
-    first = ("auv_1", 0)
+    first = ("auv_1", 0, 0)
     queue = MapQueue(config)
     oracle = KnowingMatcher(FLEET)
     queue.add_submap(FLEET.submaps[first])
@@ -117,19 +117,21 @@ def test_the_same_revision_twice_and_older_ones_change_nothing():
     answer_all(queue, KnowingMatcher(FLEET))
     before = map_bytes(queue)
     queue.changed_window()
-    newer = dataclasses.replace(FLEET.submaps["auv_2", 1], revision=1)
+    newer = dataclasses.replace(FLEET.submaps["auv_2", 0, 1], revision=1)
     queue.add_submap(newer)
-    queue.add_submap(FLEET.submaps["auv_2", 1])
+    queue.add_submap(FLEET.submaps["auv_2", 0, 1])
     queue.add_submap(newer)
     answer_all(queue, KnowingMatcher(FLEET))
     assert map_bytes(queue) == before
     assert queue.changed_window() is None
-    assert next(r for r in queue.submaps() if r.submap.submap_id == ("auv_2", 1)).submap is newer
+    assert (
+        next(r for r in queue.submaps() if r.submap.submap_id == ("auv_2", 0, 1)).submap is newer
+    )
 
 
 def test_a_revision_replaces_the_evidence():
-    queue = filled([("auv_1", 0)])
-    submap = FLEET.submaps["auv_1", 0]
+    queue = filled([("auv_1", 0, 0)])
+    submap = FLEET.submaps["auv_1", 0, 0]
     grid = dataclasses.replace(
         submap.grid, values=np.where(submap.grid.known, 100, -1).astype("i1")
     )
@@ -140,8 +142,8 @@ def test_a_revision_replaces_the_evidence():
 
 
 def test_two_submaps_under_one_name_are_refused():
-    queue = filled([("auv_1", 0)])
-    other = dataclasses.replace(FLEET.submaps["auv_1", 0], T_odom_submap=SE2(1.0, 2.0, 3.0))
+    queue = filled([("auv_1", 0, 0)])
+    other = dataclasses.replace(FLEET.submaps["auv_1", 0, 0], T_odom_submap=SE2(1.0, 2.0, 3.0))
     with pytest.raises(InvalidInputError, match="two vehicles of this name"):
         queue.add_submap(other)
 
@@ -150,17 +152,17 @@ def test_withdrawn_submaps_stay_out_when_sent_again_and_come_back_when_restored(
     queue = filled()
     answer_all(queue, KnowingMatcher(FLEET))
     before = map_bytes(queue)
-    assert queue.withdraw(("auv_2", 1))
-    queue.add_submap(dataclasses.replace(FLEET.submaps["auv_2", 1], revision=1))
+    assert queue.withdraw(("auv_2", 0, 1))
+    queue.add_submap(dataclasses.replace(FLEET.submaps["auv_2", 0, 1], revision=1))
     answer_all(queue, KnowingMatcher(FLEET))
     states = {r.submap.submap_id: r.state for r in queue.submaps()}
-    assert [i for i, s in states.items() if s is SubmapState.WITHDRAWN] == [("auv_2", 1)]
+    assert [i for i, s in states.items() if s is SubmapState.WITHDRAWN] == [("auv_2", 0, 1)]
     assert map_bytes(queue) != before
-    assert queue.restore(("auv_2", 1))
+    assert queue.restore(("auv_2", 0, 1))
     answer_all(queue, KnowingMatcher(FLEET))
     assert map_bytes(queue) == before
-    assert not queue.withdraw(("auv_9", 0))
-    assert not queue.restore(("auv_9", 0))
+    assert not queue.withdraw(("auv_9", 0, 0))
+    assert not queue.restore(("auv_9", 0, 0))
 
 
 def test_a_late_vehicle_bridges_two_components():
@@ -179,8 +181,8 @@ def test_a_late_vehicle_bridges_two_components():
 def test_the_lattice_is_pinned_to_the_first_submap_and_never_moves():
     queue = MapQueue()
     oracle = KnowingMatcher(FLEET)
-    spec = FLEET.submaps["auv_3", 0].grid.spec
-    for submap_id in [("auv_3", 0), *IDS]:
+    spec = FLEET.submaps["auv_3", 0, 0].grid.spec
+    for submap_id in [("auv_3", 0, 0), *IDS]:
         queue.add_submap(FLEET.submaps[submap_id])
         for request in queue.next_requests(1):
             queue.add_result(request.request_id, oracle(request))
@@ -189,13 +191,13 @@ def test_the_lattice_is_pinned_to_the_first_submap_and_never_moves():
         cells = shift[:2] / spec.resolution_m
         np.testing.assert_allclose(cells, np.round(cells), atol=1e-9)
         assert shift[2] == 0.0
-        anchor = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_3", 0))
+        anchor = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_3", 0, 0))
         assert anchor.T_component_submap == SE2()
 
 
 def test_a_lone_submap_is_copied_cell_by_cell():
-    queue = filled([("auv_1", 0)])
-    submap = FLEET.submaps["auv_1", 0]
+    queue = filled([("auv_1", 0, 0)])
+    submap = FLEET.submaps["auv_1", 0, 0]
     fused = queue.global_map()
     cells = fused.spec.cells_of(submap.grid.spec.centers_of(np.argwhere(submap.grid.known)))
     expected = submap.grid.values[submap.grid.known]
@@ -254,7 +256,7 @@ def test_constraints_tell_kind_and_residual():
 def test_nonsense_is_refused_by_name(changes, sentence):
     queue = MapQueue()
     with pytest.raises(InvalidInputError, match=sentence):
-        queue.add_submap(dataclasses.replace(FLEET.submaps["auv_1", 0], **changes))
+        queue.add_submap(dataclasses.replace(FLEET.submaps["auv_1", 0, 0], **changes))
     assert queue.submaps() == []
     assert queue.global_map() is None
 
@@ -262,7 +264,7 @@ def test_nonsense_is_refused_by_name(changes, sentence):
 def test_a_grid_that_is_too_large_is_refused():
     queue = MapQueue(MapQueueConfig(max_submap_cells=100))
     with pytest.raises(InvalidInputError, match="expected at most 100"):
-        queue.add_submap(FLEET.submaps["auv_1", 0])
+        queue.add_submap(FLEET.submaps["auv_1", 0, 0])
 
 
 def test_thirty_percent_of_wrong_answers_do_little_harm():
@@ -295,11 +297,11 @@ def test_searches_grow_with_the_submaps_and_not_with_their_pairs():
 
 def test_a_join_outlives_the_larger_question():
     """While a grown map is matched anew, what held before goes on to hold."""
-    queue = filled([i for i in IDS if i[1] < 3])
+    queue = filled([i for i in IDS if i.sequence < 3])
     oracle = KnowingMatcher(FLEET)
     answer_all(queue, oracle)
     assert {r.component for r in queue.submaps()} == {0}
-    queue.add_submap(FLEET.submaps["auv_3", 3])
+    queue.add_submap(FLEET.submaps["auv_3", 0, 3])
     assert queue.next_requests(1)
     assert {r.component for r in queue.submaps()} == {0}
     answer_all(queue, refuse)
@@ -320,7 +322,7 @@ def test_a_false_match_that_no_check_confirms_joins_nothing():
 def test_an_edge_falls_out_when_others_show_that_it_is_false():
     """Four single submaps; all pairs match, one of them falsely."""
     fleet = lawnmower_fleet(4, 1, 3, lane_m=5.0)
-    wrong = frozenset({("auv_01", 0), ("auv_02", 0)})
+    wrong = frozenset({("auv_01", 0, 0), ("auv_02", 0, 0)})
 
     def matcher(request):
         share = float(frozenset((*request.source_ids, *request.target_ids)) == wrong)
@@ -347,12 +349,12 @@ def test_loops_close_as_well_as_the_edges_are():
 
 
 def test_a_new_submap_redraws_only_what_it_touches():
-    queue = filled([i for i in IDS if i != ("auv_1", 3)])
+    queue = filled([i for i in IDS if i != ("auv_1", 0, 3)])
     queue.global_map()
     queue.changed_window()
-    queue.add_submap(FLEET.submaps["auv_1", 3])
+    queue.add_submap(FLEET.submaps["auv_1", 0, 3])
     spec, window = queue.changed_window()
-    submap = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_1", 3))
+    submap = next(r for r in queue.submaps() if r.submap.submap_id == ("auv_1", 0, 3))
     centre = spec.cells_of(submap.T_component_submap.as_array()[None, :2])[0]
     assert np.abs(centre - np.array(spec.shape) / 2).max() <= 2
     assert max(window.shape) <= 2 * FLEET.radius_m / spec.resolution_m + 4

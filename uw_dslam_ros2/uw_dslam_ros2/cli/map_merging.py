@@ -308,8 +308,9 @@ def _row(answer: Answer, is_used: bool, maps: dict[str, MapFile]) -> VerdictRow:
 
 def _group_name(group: SubmapGroup) -> str:
     """Its maps, the one whose frame it has first."""
-    first = group.reference[0]
-    return " + ".join([first, *(name for name, _ in group.ids if name != first)])
+    first = group.reference.vehicle_id
+    names = [submap_id.vehicle_id for submap_id in group.ids]
+    return " + ".join([first, *(name for name in names if name != first)])
 
 
 def _placements(

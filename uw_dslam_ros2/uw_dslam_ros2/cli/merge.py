@@ -181,7 +181,7 @@ def summary(result: MergedMaps, config: OfflineConfig) -> dict[str, Any]:
         "verdicts": [dataclasses.asdict(row) for row in result.rows],
         "cycles": [
             {
-                "maps": [name for name, _ in loop.submaps],
+                "maps": [submap_id.vehicle_id for submap_id in loop.submaps],
                 "error_m": loop.error_m,
                 "error_rad": loop.error_rad,
             }
@@ -219,7 +219,7 @@ def _lines(result: MergedMaps) -> list[str]:
         )
         lines += [f"  {_place(p)}, {p.reason}" for p in result.joined if p.name != result.frame]
     for loop in result.outcome.loops:
-        names = " - ".join(name for name, _ in loop.submaps)
+        names = " - ".join(submap_id.vehicle_id for submap_id in loop.submaps)
         degrees = math.degrees(loop.error_rad)
         lines.append(f"cycle {names} closes to {loop.error_m:.3f} m, {degrees:.2f} degrees")
     groups: dict[int, list[Placement]] = {}

@@ -26,7 +26,7 @@ from uw_dslam_ros2.core.merging import (
 )
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track, track_name
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
@@ -172,10 +172,10 @@ class Outcome:
 
 def names_of(ids: Iterable[SubmapId]) -> str:
     """Submaps as text: ``auv_1/0-3`` for four of one vehicle."""
-    by_vehicle: dict[str, list[int]] = {}
-    for vehicle, sequence in ids:
-        by_vehicle.setdefault(vehicle, []).append(sequence)
-    return " + ".join(f"{v}/{_ranges(sorted(s))}" for v, s in sorted(by_vehicle.items()))
+    by_track: dict[Track, list[int]] = {}
+    for submap_id in ids:
+        by_track.setdefault(submap_id.track, []).append(submap_id.sequence)
+    return " + ".join(f"{track_name(t)}/{_ranges(sorted(s))}" for t, s in sorted(by_track.items()))
 
 
 def _ranges(numbers: list[int]) -> str:
@@ -259,7 +259,8 @@ def write_outcome(folder: Path, outcome: Outcome) -> None:
             write_tum(folder / "trajectories" / f"{name}.tum", *vehicle.trajectory)
     for record in outcome.records:
         submap = record.submap
-        write_map(folder / "submaps" / f"{submap.vehicle_id}_{submap.sequence}", submap.grid)
+        name = f"{track_name(submap.submap_id.track)}_{submap.sequence}"
+        write_map(folder / "submaps" / name, submap.grid)
     rows = [_strict(asdict(row)) for row in outcome.registrations]
     write_files(
         {
@@ -300,6 +301,7 @@ def _submap_table(outcome: Outcome) -> list[dict[str, Any]]:
     return [
         {
             "vehicle_id": record.submap.vehicle_id,
+            "run_id": record.submap.run_id,
             "sequence": record.submap.sequence,
             "revision": record.submap.revision,
             "state": record.state.name,
@@ -318,8 +320,8 @@ def _graph_table(outcome: Outcome) -> dict[str, Any]:
         "edges": [
             {
                 "kind": c.kind.name,
-                "source": f"{c.source[0]}/{c.source[1]}",
-                "target": f"{c.target[0]}/{c.target[1]}",
+                "source": str(c.source),
+                "target": str(c.target),
                 "T_target_source": c.T_target_source.as_array().tolist(),
                 "covariance": c.covariance.tolist(),
                 "residual_m": c.residual_m,
@@ -331,7 +333,7 @@ def _graph_table(outcome: Outcome) -> dict[str, Any]:
         ],
         "loops": [
             {
-                "submaps": [f"{vehicle}/{number}" for vehicle, number in loop.submaps],
+                "submaps": [str(submap_id) for submap_id in loop.submaps],
                 "error_m": loop.error_m,
                 "error_deg": math.degrees(loop.error_rad),
             }

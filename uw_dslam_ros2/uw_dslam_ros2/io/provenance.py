@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec
 from uw_dslam_ros2.core.merging import MapProvenance
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.atomic import write_files
 
 __all__ = ["contradictions_png", "read_provenance", "write_provenance"]
@@ -40,7 +41,7 @@ def write_provenance(path_prefix: str | Path, provenance: MapProvenance) -> list
     header = {
         "resolution_m": provenance.spec.resolution_m,
         "origin": provenance.spec.T_frame_grid.as_array().tolist(),
-        "contributors": [[f"{v}/{n}" for v, n in ids] for ids in provenance.contributors],
+        "contributors": [[_text(i) for i in ids] for ids in provenance.contributors],
     }
     archive = io.BytesIO()
     np.savez_compressed(
@@ -70,16 +71,27 @@ def read_provenance(path: str | Path) -> MapProvenance:
             header = json.loads(arrays["header"].tobytes())
             contradictions, owners = arrays["contradictions"], arrays["owners"]
         contributors = tuple(
-            tuple(
-                (vehicle, int(number)) for vehicle, _, number in (i.rpartition("/") for i in ids)
-            )
-            for ids in header["contributors"]
+            tuple(_submap_id(text) for text in ids) for ids in header["contributors"]
         )
         rows, cols = owners.shape
         spec = GridSpec(header["resolution_m"], rows, cols, SE2(*header["origin"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is not a map's provenance: {error}") from error
     return MapProvenance(spec, contradictions, owners, contributors)
+
+
+def _text(submap_id: SubmapId) -> str:
+    """``vehicle/sequence``, or ``vehicle#run/sequence`` where the run is known."""
+    vehicle, run, sequence = submap_id
+    return f"{vehicle}/{sequence}" if run == 0 else f"{vehicle}#{run}/{sequence}"
+
+
+def _submap_id(text: str) -> SubmapId:
+    track, _, sequence = text.rpartition("/")
+    vehicle, mark, run = track.rpartition("#")
+    return (
+        SubmapId(vehicle, int(run), int(sequence)) if mark else SubmapId(track, 0, int(sequence))
+    )
 
 
 def contradictions_png(provenance: MapProvenance) -> bytes:

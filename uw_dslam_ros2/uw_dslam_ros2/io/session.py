@@ -12,7 +12,7 @@ import io
 import json
 import sqlite3
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from uw_dslam_ros2.core.merging.answers import Answer, Query
 from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track, track_name
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum
@@ -40,10 +40,11 @@ _VERSION = 1
 _TABLES = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS submaps (
-    vehicle_id TEXT, sequence INTEGER, digest BLOB NOT NULL, content BLOB NOT NULL,
-    PRIMARY KEY (vehicle_id, sequence));
+    vehicle_id TEXT, run_id INTEGER, sequence INTEGER, digest BLOB NOT NULL,
+    content BLOB NOT NULL, PRIMARY KEY (vehicle_id, run_id, sequence));
 CREATE TABLE IF NOT EXISTS withdrawn (
-    vehicle_id TEXT, sequence INTEGER, PRIMARY KEY (vehicle_id, sequence));
+    vehicle_id TEXT, run_id INTEGER, sequence INTEGER,
+    PRIMARY KEY (vehicle_id, run_id, sequence));
 CREATE TABLE IF NOT EXISTS answers (digest BLOB PRIMARY KEY, content TEXT NOT NULL);
 """
 
@@ -117,7 +118,7 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
     records = queue.submaps()
     for record in records:
         submap = record.submap
-        name = f"{_file_name(submap.vehicle_id)}_{submap.sequence:04d}"
+        name = f"{_file_name(track_name(submap.submap_id.track))}_{submap.sequence:04d}"
         written += write_map(folder / "submaps" / name, submap.grid)
     for vehicle, (stamps_ns, poses) in queue.trajectories().items():
         path = folder / "trajectories" / f"{_file_name(vehicle)}.tum"
@@ -161,8 +162,13 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 def _create(connection: sqlite3.Connection, path: Path) -> None:
     (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if version == 0:
+    columns = [row[1] for row in connection.execute("PRAGMA table_info(submaps)")]
+    if version == 0 or "run_id" not in columns:
         connection.execute("BEGIN IMMEDIATE")
+        if version:
+            # From before there were runs. All is written anew, in the same transaction or none.
+            connection.execute("DROP TABLE submaps")
+            connection.execute("DROP TABLE withdrawn")
         for statement in filter(str.strip, _TABLES.split(";")):
             connection.execute(statement)
         connection.execute(f"PRAGMA user_version = {_VERSION}")
@@ -180,7 +186,7 @@ def _write(connection: sqlite3.Connection, state: QueueState) -> None:
     _write_submaps(connection, state)
     connection.execute("DELETE FROM withdrawn")
     for submap_id in sorted(state.withdrawn):
-        connection.execute("INSERT INTO withdrawn VALUES (?, ?)", submap_id)
+        connection.execute("INSERT INTO withdrawn VALUES (?, ?, ?)", submap_id)
     held = {row[0] for row in connection.execute("SELECT digest FROM answers")}
     wanted = {_answer_digest(answer): answer for answer in state.answers}
     for digest in sorted(held - set(wanted)):
@@ -191,7 +197,7 @@ def _write(connection: sqlite3.Connection, state: QueueState) -> None:
     meta = {
         "anchor": state.anchor,
         "lattice": None if state.lattice is None else _spec_to_plain(state.lattice),
-        "vehicles": state.vehicles,
+        "vehicles": state.tracks,
         "next_request_id": state.next_request_id,
         "standing": [[s.hex(), t.hex(), prior] for s, t, prior in sorted(state.standing)],
         "is_pinned": state.is_pinned,
@@ -202,31 +208,30 @@ def _write(connection: sqlite3.Connection, state: QueueState) -> None:
 
 
 def _write_submaps(connection: sqlite3.Connection, state: QueueState) -> None:
-    rows = connection.execute("SELECT vehicle_id, sequence, digest FROM submaps")
-    held = {(vehicle, sequence): digest for vehicle, sequence, digest in rows}
+    rows = connection.execute("SELECT vehicle_id, run_id, sequence, digest FROM submaps")
+    held = {SubmapId(*name): digest for *name, digest in rows}
     for submap_id in sorted(set(held) - {submap.submap_id for submap in state.submaps}):
-        where = "WHERE vehicle_id = ? AND sequence = ?"
+        where = "WHERE vehicle_id = ? AND run_id = ? AND sequence = ?"
         connection.execute(f"DELETE FROM submaps {where}", submap_id)
     for submap in state.submaps:
         digest = _submap_digest(submap)
         if held.get(submap.submap_id) != digest:
             row = (*submap.submap_id, digest, _submap_to_bytes(submap))
-            connection.execute("INSERT OR REPLACE INTO submaps VALUES (?, ?, ?, ?)", row)
+            connection.execute("INSERT OR REPLACE INTO submaps VALUES (?, ?, ?, ?, ?)", row)
 
 
 def _read(connection: sqlite3.Connection) -> QueueState:
     meta = {name: json.loads(v) for name, v in connection.execute("SELECT name, value FROM meta")}
-    order = "ORDER BY vehicle_id, sequence"
-    submaps = connection.execute(f"SELECT content FROM submaps {order}")
+    submaps = connection.execute("SELECT content FROM submaps")
     answers = connection.execute("SELECT content FROM answers")
     anchor, lattice = meta["anchor"], meta["lattice"]
     return QueueState(
-        tuple(_submap_from_bytes(content) for (content,) in submaps),
-        frozenset(connection.execute("SELECT vehicle_id, sequence FROM withdrawn").fetchall()),
+        tuple(sorted((_submap_from_bytes(content) for (content,) in submaps), key=_by_submap_id)),
+        frozenset(_submap_id(row) for row in connection.execute("SELECT * FROM withdrawn")),
         tuple(_answer_from_plain(json.loads(content)) for (content,) in answers),
-        None if anchor is None else (anchor[0], anchor[1]),
+        None if anchor is None else _submap_id(anchor),
         None if lattice is None else _spec_from_plain(lattice),
-        tuple(meta["vehicles"]),
+        tuple(_track(plain) for plain in meta["vehicles"]),
         meta["next_request_id"],
         frozenset(
             (bytes.fromhex(source), bytes.fromhex(target), tuple(prior))
@@ -236,7 +241,22 @@ def _read(connection: sqlite3.Connection) -> QueueState:
     )
 
 
-_SUBMAP_SCALARS = ("vehicle_id", "sequence", "revision", "is_final", "stamp_ns")
+def _by_submap_id(submap: Submap) -> SubmapId:
+    return submap.submap_id
+
+
+def _submap_id(plain: Sequence[Any]) -> SubmapId:
+    """A submap's key; without a run in sessions from before there were runs."""
+    vehicle, *run, sequence = plain
+    return SubmapId(vehicle, run[0] if run else 0, sequence)
+
+
+def _track(plain: Any) -> Track:
+    """A track; only the vehicle's name in sessions from before there were runs."""
+    return Track(plain, 0) if isinstance(plain, str) else Track(*plain)
+
+
+_SUBMAP_SCALARS = ("vehicle_id", "run_id", "sequence", "revision", "is_final", "stamp_ns")
 _SUBMAP_ARRAYS = ("covariance", "points", "trajectory", "trajectory_stamp_ns")
 
 
@@ -331,7 +351,7 @@ def _group_to_plain(group: SubmapGroup) -> dict[str, Any]:
 
 def _group_from_plain(plain: dict[str, Any]) -> SubmapGroup:
     members: dict[SubmapId, SE2] = {}
-    for vehicle, sequence, x, y, yaw in plain["members"]:
-        members[vehicle, sequence] = SE2(x, y, yaw)
-    vehicle, sequence = plain["reference"]
-    return SubmapGroup((vehicle, sequence), members, bytes.fromhex(plain["key"]))
+    for *name, x, y, yaw in plain["members"]:
+        members[_submap_id(name)] = SE2(x, y, yaw)
+    reference = _submap_id(plain["reference"])
+    return SubmapGroup(reference, members, bytes.fromhex(plain["key"]))

@@ -76,8 +76,11 @@ class Fleet:
     T_world_submap: dict[SubmapId, SE2] = field(default_factory=dict)
     submaps: dict[SubmapId, Submap] = field(default_factory=dict)
 
-    def add_vehicle(self, name: str, poses: list[SE2], seed: int) -> None:
-        """Drive through poses in the world; odometry errs by the fleet's sigmas at each step."""
+    def add_vehicle(self, name: str, poses: list[SE2], seed: int, run_id: int = 0) -> None:
+        """Drive through poses in the world; odometry errs by the fleet's sigmas at each step.
+
+        Each run of a vehicle has an odom frame of its own.
+        """
         rng = np.random.default_rng([seed, 2])
         T_odom_submap = SE2.from_array(rng.uniform(-1.0, 1.0, 3) * (50.0, 50.0, math.pi))
         sigmas = np.array([self.sigma_m, self.sigma_m, self.sigma_rad])
@@ -89,8 +92,9 @@ class Fleet:
                 T_odom_submap = T_odom_submap @ step @ error
                 turn[:2, :2] = T_odom_submap.rotation()
             covariance = turn @ np.diag(sigmas**2) @ turn.T if sequence else np.zeros((3, 3))
-            self.T_world_submap[name, sequence] = T_world_submap
-            self.submaps[name, sequence] = Submap(
+            submap_id = SubmapId(name, run_id, sequence)
+            self.T_world_submap[submap_id] = T_world_submap
+            self.submaps[submap_id] = Submap(
                 vehicle_id=name,
                 sequence=sequence,
                 revision=0,
@@ -101,6 +105,7 @@ class Fleet:
                 grid=view_from(self.world, T_world_submap, self.radius_m),
                 trajectory=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.1]]),
                 trajectory_stamp_ns=np.array([10 * sequence, 10 * sequence + 5]) * _NS + 10 * _NS,
+                run_id=run_id,
             )
 
     def position_rmse_m(self, queue: MapQueue, component: int = 0) -> float:
@@ -183,7 +188,11 @@ class KnowingMatcher:
     def __call__(self, request: MatchRequest) -> RegistrationResult:
         """Answer one request."""
         self.num_asked += 1
-        question = repr((request.source_ids, request.target_ids, request.prior)).encode()
+        sides = [
+            f"({', '.join(i.stable_name for i in ids)}{',' * (len(ids) == 1)})"
+            for ids in (request.source_ids, request.target_ids)
+        ]
+        question = f"({sides[0]}, {sides[1]}, {request.prior!r})".encode()
         digest = hashlib.blake2b(question, digest_size=8).digest()
         rng = np.random.default_rng([self.seed, int.from_bytes(digest)])
         if rng.random() < self.wrong_share:

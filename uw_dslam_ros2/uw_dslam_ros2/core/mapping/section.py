@@ -54,7 +54,9 @@ class ClosedSection:
             return 0.0
         return float(np.quantile(np.linalg.norm(self.points - self.center, axis=1), 0.9))
 
-    def to_submap(self, vehicle_id: str, T_odom_submap: SE2, log_odds_max: float) -> Submap:
+    def to_submap(
+        self, vehicle_id: str, run_id: int, T_odom_submap: SE2, log_odds_max: float
+    ) -> Submap:
         """What the vehicle gives away."""
         return Submap(
             vehicle_id,
@@ -68,6 +70,7 @@ class ClosedSection:
             self.points,
             self.trajectory,
             self.stamps_ns,
+            run_id,
         )
 
 

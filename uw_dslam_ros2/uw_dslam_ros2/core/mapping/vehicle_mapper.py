@@ -31,7 +31,7 @@ from uw_dslam_ros2.core.sonar import (
     place_sweep,
 )
 from uw_dslam_ros2.core.sonar.turning import Sweep, beams_of_image, is_few_beams
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
 
 __all__ = ["VehicleMapper"]
 
@@ -54,14 +54,17 @@ class VehicleMapper:
     Messages are to come in the order of their stamps, a ping after the navigation of its moment:
     `io.feeding.in_stamp_order` and the mapper's node see to that. Navigation that is late all the
     same is put where it belongs, for the pings that follow; a ping that is late, or earlier than
-    all navigation, is left out and counted. The odom frame begins where the vehicle does.
+    all navigation, is left out and counted. The odom frame begins where the vehicle does. A mapper
+    is one run (`core.submap.Track`): who begins again makes a new one, with another ``run_id``.
     """
 
-    def __init__(self, config: VehicleMapperConfig, vehicle_id: str) -> None:
+    def __init__(self, config: VehicleMapperConfig, vehicle_id: str, run_id: int = 1) -> None:
         if not vehicle_id:
             raise InvalidInputError("vehicle_id is empty, expected a name")
+        if not 0 < run_id <= MAX_RUN_ID:
+            raise InvalidInputError(f"run_id is {run_id}, expected 1 to {MAX_RUN_ID}")
         self._config = config
-        self._vehicle_id = vehicle_id
+        self._vehicle_id, self._run_id = vehicle_id, run_id
         self._navigation = NavigationFilter(config.navigation)
         self._estimator = make_estimator(config)
         self._local_map = LocalMap(config.match)
@@ -460,7 +463,10 @@ class VehicleMapper:
             section.T_odom_issued = T_odom_submap
             issued.append(
                 section.to_submap(
-                    self._vehicle_id, T_odom_submap, self._config.occupancy.log_odds_max
+                    self._vehicle_id,
+                    self._run_id,
+                    T_odom_submap,
+                    self._config.occupancy.log_odds_max,
                 )
             )
         return issued

@@ -54,7 +54,7 @@ class GlobalMap:
         if window is None or contradictions is None:
             return None
         owners, sets = self._mosaic.contributor_sets()
-        named = tuple(tuple((str(i[0]), int(i[1])) for i in sorted(keys)) for keys in sets)  # type: ignore[index,type-var]
+        named = tuple(tuple(sorted(SubmapId(*i) for i in keys)) for keys in sets)  # type: ignore[misc]
         return MapProvenance(self._mosaic.spec_of(window), contradictions, owners, named)
 
 

@@ -4,12 +4,12 @@ The plan of `plan` is worked out for maps that are there as a whole; asked again
 it would ask nearly all of its questions each time. While more is expected, this plan is used:
 
 1. What holds goes on to hold.
-2. Vehicles that are still apart are matched as wholes, the most promising pair first and one
-   question for each vehicle at a time; a pair that was refused only when the two maps have grown
+2. Tracks that are still apart are matched as wholes, the most promising pair first and one
+   question for each track at a time; a pair that was refused only when the two maps have grown
    so much together that another answer can be hoped for.
 3. What was accepted is checked as in `plan`; checks of the same submaps count, although their
    poses have moved a little since.
-4. A new submap of a vehicle that is joined is matched once, where it has seen most of what was
+4. A new submap of a track that is joined is matched once, where it has seen most of what was
    seen before, if the graph is vague there.
 
 When the vehicles have come to rest, `plan` asks what is left to ask, and decides: so the map in
@@ -27,13 +27,11 @@ from uw_dslam_ros2.core.merging.components import Component, Constraint
 from uw_dslam_ros2.core.merging.config import NUM_NEIGHBOURS, VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.descriptors import promise
 from uw_dslam_ros2.core.merging.library import Library
-from uw_dslam_ros2.core.merging.plan import Plan, component_numbers, most_promising
+from uw_dslam_ros2.core.merging.plan import Pair, Plan, component_numbers, most_promising
 from uw_dslam_ros2.core.merging.verification import Verifier
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["make_growing_plan"]
-
-Pair = tuple[str, str]
 
 
 def make_growing_plan(
@@ -88,17 +86,17 @@ class _GrowingPlanner:
         return self._library.solve(self._anchor, constraints)
 
     def _apart(self, components: Sequence[Component]) -> list[Pair]:
-        """The best pairs of vehicles of different components, the most promising first."""
+        """The best pairs of tracks of different components, the most promising first."""
         where = component_numbers(components)
-        number = {v: where[self._library.closed(v)[0]] for v in self._library.vehicles}
+        number = {t: where[self._library.closed(t)[0]] for t in self._library.tracks}
         pairs = [
             pair
-            for pair in itertools.combinations(self._library.vehicles, 2)
+            for pair in itertools.combinations(self._library.tracks, 2)
             if number[pair[0]] != number[pair[1]]
         ]
         if len(pairs) < 2:
             return pairs
-        shapes = {v: self._library.rough_shape(v) for pair in pairs for v in pair}
+        shapes = {t: self._library.rough_shape(t) for pair in pairs for t in pair}
         pairs.sort(key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
         return most_promising(pairs, self._config.max_partners)
 
@@ -117,7 +115,7 @@ class _GrowingPlanner:
         return []
 
     def _ask_best(self, pairs: Iterable[Pair]) -> None:
-        busy: set[str] = set()
+        busy: set[Track] = set()
         for target, source in pairs:
             if busy.isdisjoint((target, source)) and self._has_grown((target, source)):
                 groups = self._library.closed_group(source), self._library.closed_group(target)
@@ -133,12 +131,12 @@ class _GrowingPlanner:
     def _tie_newest(
         self, component: Component, constraints: Sequence[Constraint]
     ) -> list[Constraint]:
-        """Step 4: the newest place of each vehicle whose neighbours are there."""
+        """Step 4: the newest place of each track whose neighbours are there."""
         side = self._library.component_side(component)
         reach = NUM_NEIGHBOURS
         newest = set()
-        for vehicle in {submap_id[0] for submap_id in side.T_frame_submap}:
-            ids = self._library.closed(vehicle)
+        for track in {submap_id.track for submap_id in side.T_frame_submap}:
+            ids = self._library.closed(track)
             newest.add(ids[max(0, len(ids) - 1 - reach)])
         inliers = [constraint for constraint in constraints if constraint.is_inlier]
         vague_cells = self._config.growth * VAGUE_CELLS
@@ -146,12 +144,12 @@ class _GrowingPlanner:
 
 
 def _claims(library: Library, answers: Iterable[Answer]) -> dict[Pair, list[Answer]]:
-    """Answers to questions without a guess, of one vehicle's map in another's; largest first."""
+    """Answers to questions without a guess, of one track's map in another's; largest first."""
     found: dict[Pair, list[Answer]] = {}
     for answer in answers:
         query = answer.query
-        source = {submap_id[0] for submap_id in query.source.ids}
-        target = {submap_id[0] for submap_id in query.target.ids}
+        source = {submap_id.track for submap_id in query.source.ids}
+        target = {submap_id.track for submap_id in query.target.ids}
         is_pair = query.prior is None and len(source) == len(target) == 1 and source != target
         if is_pair and library.holds(query):
             first, second = sorted(source | target)

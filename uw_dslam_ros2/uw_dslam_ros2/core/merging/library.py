@@ -23,7 +23,7 @@ from uw_dslam_ros2.core.merging.submap_groups import (
     shared_area_m2,
 )
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["Library", "Memory", "milestone"]
 
@@ -33,7 +33,7 @@ Memory = dict[Hashable, Any]
 
 _GROWTH = 1.5
 _PART_LENGTH = 6
-"""Consecutive submaps in a part of a vehicle's map that is matched by itself."""
+"""Consecutive submaps in a part of a track's map that is matched by itself."""
 _MAX_MEMORY = 200_000
 
 
@@ -54,7 +54,7 @@ class Library:
     Parameters
     ----------
     submaps
-        All; withdrawn ones still carry their vehicle's odometry.
+        All; withdrawn ones still carry their track's odometry.
     withdrawn
         Those that are neither matched nor drawn.
     memory
@@ -75,49 +75,49 @@ class Library:
         self.active = {
             i: s for i, s in sorted(submaps.items()) if i not in withdrawn and len(s.footprint)
         }
-        self._by_vehicle: dict[str, list[SubmapId]] = {}
+        self._by_track: dict[Track, list[SubmapId]] = {}
         for submap_id in self.active:
-            self._by_vehicle.setdefault(submap_id[0], []).append(submap_id)
+            self._by_track.setdefault(submap_id.track, []).append(submap_id)
         self._state = tuple(
             (i, s.submap.T_odom_submap, s.submap.covariance.tobytes())
             for i, s in sorted(submaps.items())
         )
 
-    def whole_groups(self) -> dict[str, SubmapGroup]:
-        """Each vehicle's map up to its last milestone, of closed submaps where there are any."""
+    def whole_groups(self) -> dict[Track, SubmapGroup]:
+        """Each track's map up to its last milestone, of closed submaps where there are any."""
         groups = {}
-        for vehicle in self._by_vehicle:
-            ids = self.closed(vehicle)
-            groups[vehicle] = self._odometry_group(ids[: milestone(len(ids))])
+        for track in self._by_track:
+            ids = self.closed(track)
+            groups[track] = self._odometry_group(ids[: milestone(len(ids))])
         return groups
 
     @property
-    def vehicles(self) -> list[str]:
+    def tracks(self) -> list[Track]:
         """Those that have something to match, sorted."""
-        return sorted(self._by_vehicle)
+        return sorted(self._by_track)
 
-    def closed(self, vehicle: str) -> list[SubmapId]:
-        """A vehicle's closed submaps; all of them where none is closed yet."""
-        ids = self._by_vehicle[vehicle]
+    def closed(self, track: Track) -> list[SubmapId]:
+        """A track's closed submaps; all of them where none is closed yet."""
+        ids = self._by_track[track]
         return [i for i in ids if self.active[i].submap.is_final] or ids
 
-    def closed_group(self, vehicle: str) -> SubmapGroup:
-        """All of a vehicle's closed submaps."""
-        return self._odometry_group(self.closed(vehicle))
+    def closed_group(self, track: Track) -> SubmapGroup:
+        """All of a track's closed submaps."""
+        return self._odometry_group(self.closed(track))
 
     def window(self, submap_id: SubmapId) -> SubmapGroup:
-        """A submap with its neighbours in its vehicle's sequence."""
-        ids = self.closed(submap_id[0])
+        """A submap with its neighbours along its track."""
+        ids = self.closed(submap_id.track)
         index = ids.index(submap_id)
         reach = NUM_NEIGHBOURS if len(ids) > 2 * NUM_NEIGHBOURS + 1 else 0
         low, high = max(0, index - reach), index + reach + 1
         return self._odometry_group(ids[low:high], submap_id)
 
     def parts(self, side: Side) -> list[SubmapGroup]:
-        """Stretches of each vehicle in a side, overlapping by half; never all of a vehicle."""
+        """Stretches of each track in a side, overlapping by half; never all of a track."""
         groups: list[SubmapGroup] = []
-        for vehicle in sorted({submap_id[0] for submap_id in side.T_frame_submap}):
-            ids = self.closed(vehicle)
+        for track in sorted({submap_id.track for submap_id in side.T_frame_submap}):
+            ids = self.closed(track)
             length = min(_PART_LENGTH, -(-len(ids) // 2))
             stride = max(1, length // 2)
             last = len(ids) - length
@@ -132,28 +132,28 @@ class Library:
         poses = [side.T_frame_submap[i] for i in ids]
         return SubmapGroup.of(members, poses, len(ids) // 2)
 
-    def vehicle_side(self, vehicle: str) -> Side:
-        """A vehicle's closed submaps, placed by its own odometry."""
-        return self.side_of(self.closed(vehicle))
+    def track_side(self, track: Track) -> Side:
+        """A track's closed submaps, placed by its own odometry."""
+        return self.side_of(self.closed(track))
 
     def side_of(self, ids: Sequence[SubmapId]) -> Side:
-        """Submaps of one vehicle, placed by its own odometry."""
+        """Submaps of one track, placed by its own odometry."""
         poses = {i: self.odometry.T_odom_submap(i) for i in ids}
         return Side(poses, self.odometry.covariance)
 
-    def component_side(self, component: Component, vehicle: str | None = None) -> Side:
-        """The closed submaps of a component, or of one vehicle in it, placed by the graph."""
-        vehicles = sorted({i[0] for i in component}) if vehicle is None else [vehicle]
-        ids = [i for v in vehicles if v in self._by_vehicle for i in self.closed(v)]
+    def component_side(self, component: Component, track: Track | None = None) -> Side:
+        """The closed submaps of a component, or of one track in it, placed by the graph."""
+        tracks = sorted({i.track for i in component}) if track is None else [track]
+        ids = [i for t in tracks if t in self._by_track for i in self.closed(t)]
         poses = {i: component[i] for i in ids if i in component}
-        first = {v: self.closed(v)[0] for v in vehicles if v in self._by_vehicle}
+        first = {t: self.closed(t)[0] for t in tracks if t in self._by_track}
 
         def covariance(target: SubmapId, source: SubmapId) -> FloatArray:
-            if target[0] == source[0]:
+            if target.track == source.track:
                 return self.odometry.covariance(target, source)
-            # Through each vehicle's beginning: an honest guess from above.
-            return self.odometry.covariance(target, first[target[0]]) + (
-                self.odometry.covariance(source, first[source[0]])
+            # Through each track's beginning: an honest guess from above.
+            return self.odometry.covariance(target, first[target.track]) + (
+                self.odometry.covariance(source, first[source.track])
             )
 
         return Side(poses, covariance)
@@ -172,9 +172,9 @@ class Library:
         """Descriptor of the group's map."""
         return self._remember(("shape", group.key), lambda: shape_of(self.render(group)))
 
-    def rough_shape(self, vehicle: str) -> MapShape:
-        """Descriptor of a vehicle's map, as it was at its last milestone."""
-        ids = self.closed(vehicle)[: milestone(len(self.closed(vehicle)))]
+    def rough_shape(self, track: Track) -> MapShape:
+        """Descriptor of a track's map, as it was at its last milestone."""
+        ids = self.closed(track)[: milestone(len(self.closed(track)))]
         key = ("rough", tuple((i, self.active[i].digest) for i in ids))
         return self._remember(key, lambda: shape_of(self.render(self._odometry_group(ids))))
 

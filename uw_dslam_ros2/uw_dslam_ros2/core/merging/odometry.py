@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Odometry:
-    """Edges between each vehicle's consecutive submaps, and what follows along them."""
+    """Edges between each track's consecutive submaps, and what follows along them."""
 
     def __init__(self, submaps: Mapping[SubmapId, StoredSubmap]) -> None:
         self._submaps = submaps
@@ -30,18 +30,18 @@ class Odometry:
         self._previous: dict[SubmapId, SubmapId] = {}
         self._covariances: dict[tuple[SubmapId, SubmapId], FloatArray] = {}
         for before, after in itertools.pairwise(sorted(submaps)):
-            if before[0] == after[0]:
+            if before.track == after.track:
                 edge = self._edge(before, after)
                 self.edges.append(edge)
                 self._step[after] = edge
                 self._previous[after] = before
 
     def T_odom_submap(self, submap_id: SubmapId) -> SE2:  # noqa: N802 (notation of motions)
-        """Pose in the vehicle's odom frame, by its newest revision."""
+        """Pose in the run's odom frame, by its newest revision."""
         return self._submaps[submap_id].submap.T_odom_submap
 
     def covariance(self, target: SubmapId, source: SubmapId) -> FloatArray:
-        """Covariance (3, 3) of ``T_target_source`` of two submaps of one vehicle."""
+        """Covariance (3, 3) of ``T_target_source`` of two submaps of one track."""
         if target == source:
             return np.zeros((3, 3))
         held = self._covariances.get((target, source))
@@ -56,8 +56,8 @@ class Odometry:
         return found
 
     def spread(self, submap_id: SubmapId, members: tuple[SubmapId, ...]) -> FloatArray:
-        """Mean covariance of the vehicle's members around one of them: how far a map is bent."""
-        own = [member for member in members if member[0] == submap_id[0]]
+        """Mean covariance of the track's members around one of them: how far a map is bent."""
+        own = [member for member in members if member.track == submap_id.track]
         return np.mean([self.covariance(submap_id, member) for member in own], axis=0)
 
     def _extended(self, target: SubmapId, source: SubmapId) -> FloatArray:
@@ -80,6 +80,6 @@ class Odometry:
         turn = np.eye(3)
         turn[:2, :2] = earlier.T_odom_submap.rotation().T
         # Submaps that are missing in between count as much as the one that is there.
-        covariance = turn @ later.covariance @ turn.T * (after[1] - before[1])
+        covariance = turn @ later.covariance @ turn.T * (after.sequence - before.sequence)
         T_before_after = earlier.T_odom_submap.inverse() @ later.T_odom_submap
         return Edge(after, before, T_before_after, covariance)

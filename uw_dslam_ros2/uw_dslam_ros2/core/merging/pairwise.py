@@ -15,20 +15,20 @@ from uw_dslam_ros2.core.merging.plan import Plan
 from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.merging.verification import Verifier
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["make_pairwise_plan"]
 
 
 def make_pairwise_plan(
     library: Library,
-    vehicles: Sequence[str],
+    tracks: Sequence[Track],
     answers: Mapping[QueryKey, Answer],
     anchor: SubmapId,
     *,
     is_growing: bool = False,
 ) -> Plan:
-    """Merge the vehicles' maps in the order given, and say which question is open.
+    """Merge the tracks' maps in the order given, and say which question is open.
 
     The first map of the queue is matched with the next one. A merged map goes to the end; a map
     that matches no other goes there too, and is tried again with what has been merged meanwhile.
@@ -36,19 +36,19 @@ def make_pairwise_plan(
     Parameters
     ----------
     library
-        The submaps; each vehicle's are one map by its own odometry.
-    vehicles
+        The submaps; each track's are one map by its own odometry.
+    tracks
         In order of arrival.
     answers
         By the key of the question.
     anchor
         The submap that the global frame is pinned to.
     is_growing
-        More submaps are expected: match each vehicle's first 1, 2, 4, 8, ... submaps, so that not
+        More submaps are expected: match each track's first 1, 2, 4, 8, ... submaps, so that not
         each new one asks everything anew.
     """
     verifier = Verifier(library, answers)
-    queue = [_vehicle_map(library, vehicle) for vehicle in vehicles]
+    queue = [_track_map(library, track) for track in tracks]
     idle = [c for c in queue if not library.component_side(c).T_frame_submap]
     queue = [component for component in queue if component not in idle]
     refused: set[frozenset[bytes]] = set()
@@ -71,19 +71,19 @@ def make_pairwise_plan(
     return Plan(wanted, constraints, library.odometry.edges, components)
 
 
-def _vehicle_map(library: Library, vehicle: str) -> Component:
-    ids = sorted(submap_id for submap_id in library.submaps if submap_id[0] == vehicle)
+def _track_map(library: Library, track: Track) -> Component:
+    ids = sorted(submap_id for submap_id in library.submaps if submap_id.track == track)
     T_first_odom = library.odometry.T_odom_submap(ids[0]).inverse()
     return {i: T_first_odom @ library.odometry.T_odom_submap(i) for i in ids}
 
 
 def _group(library: Library, component: Component, is_growing: bool) -> SubmapGroup:
-    """What is matched of a map: all, or the first 1, 2, 4, 8, ... submaps of each vehicle."""
+    """What is matched of a map: all, or the first 1, 2, 4, 8, ... submaps of each track."""
     side = library.component_side(component)
     if is_growing:
-        members: dict[str, list[SubmapId]] = {}
+        members: dict[Track, list[SubmapId]] = {}
         for submap_id in sorted(side.T_frame_submap):
-            members.setdefault(submap_id[0], []).append(submap_id)
+            members.setdefault(submap_id.track, []).append(submap_id)
         begun = [i for ids in members.values() for i in ids[: 1 << (len(ids).bit_length() - 1)]]
         side = Side({i: side.T_frame_submap[i] for i in begun}, side.covariance)
     return library.component_group(side)

@@ -105,7 +105,7 @@ def vague_places(
 def pose_uncertainty(main: Edge | None, ends: Ends, source: Side, target: Side) -> FloatArray:
     """Covariance (3, 3) of where one submap lies in another of the other side.
 
-    Over the edge `main`; without one, along both vehicles from their beginnings.
+    Over the edge `main`; without one, along both tracks from their beginnings.
     """
     if main is None:
         ways = [
@@ -137,11 +137,11 @@ def _known_best(
 ) -> FloatArray:
     """Covariance (3, 3) of a relative pose along odometry, or over the best single edge."""
     ends = source_id, target_id
-    known = [side.covariance(target_id, source_id)] if source_id[0] == target_id[0] else []
+    known = [side.covariance(target_id, source_id)] if source_id.track == target_id.track else []
     for edge in edges:
-        if (edge.source[0], edge.target[0]) == (source_id[0], target_id[0]):
+        if (edge.source.track, edge.target.track) == (source_id.track, target_id.track):
             known.append(pose_uncertainty(edge, ends, side, side))
-        elif (edge.target[0], edge.source[0]) == (source_id[0], target_id[0]):
+        elif (edge.target.track, edge.source.track) == (source_id.track, target_id.track):
             known.append(pose_uncertainty(edge.reversed(), ends, side, side))
     if not known:
         known = [side.covariance(target_id, source_id)]
@@ -168,4 +168,4 @@ def _spaced(pairs: Sequence[Ends], num_neighbours: int, limit: int, *, fill: boo
 
 
 def _is_apart(one: SubmapId, other: SubmapId, num_neighbours: int) -> bool:
-    return one[0] != other[0] or abs(one[1] - other[1]) > num_neighbours
+    return one.track != other.track or abs(one.sequence - other.sequence) > num_neighbours

@@ -4,17 +4,17 @@ A plan depends on the submaps and the answers alone, and not on the order in whi
 worked out anew after each change, and what has been answered is not asked again. So a queue that
 was fed in any order comes to the same map, and one that was interrupted goes on where it was.
 
-Its steps:
+Its steps; a *track* is one run of one vehicle, and two runs may be joined like two vehicles:
 
-1. Whole maps of two vehicles each, the most promising pairs first, without a guess.
+1. Whole maps of two tracks each, the most promising pairs first, without a guess.
 2. What was accepted is checked: smaller maps of neighbouring submaps from both sides are matched
    again, each only near where the first match puts it. A match that none of its checks confirms
    is dropped, and the largest set that agrees goes into the graph.
-3. Vehicles that meet according to the graph, but did not match directly, are matched where they
+3. Tracks that meet according to the graph, but did not match directly, are matched where they
    meet.
 4. Components that are still apart are matched as wholes, and by their most promising parts; what
    is accepted there is checked likewise. This goes on as long as something joins.
-5. Where the graph is still vague although two places have seen the same, of one vehicle or of two,
+5. Where the graph is still vague although two places have seen the same, of one track or of two,
    they are matched near where the graph puts them.
 """
 
@@ -34,10 +34,11 @@ from uw_dslam_ros2.core.merging.library import Library
 from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.verification import Verifier
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.submap import SubmapId, Track
 
-__all__ = ["Plan", "component_numbers", "make_plan", "most_promising"]
+__all__ = ["Pair", "Plan", "component_numbers", "make_plan", "most_promising"]
 
+Pair = tuple[Track, Track]
 _MAX_PART_SEARCHES = 4
 """Searches between two components by their most promising parts."""
 
@@ -99,10 +100,10 @@ class _Planner:
         """Work the plan out; the steps of the module's description."""
         ranked = self._ranked(self._groups)
         first = most_promising(ranked, self._config.max_partners)
-        constraints = self._match_vehicles(first)
+        constraints = self._match_tracks(first)
         if not self._is_waiting():
             apart = self._apart(constraints, [pair for pair in ranked if pair not in set(first)])
-            constraints += self._match_vehicles(apart)
+            constraints += self._match_tracks(apart)
         if not self._is_waiting():
             constraints += self._match_meeting(constraints)
         for _ in range(len(self._groups)):
@@ -119,43 +120,43 @@ class _Planner:
     def _is_waiting(self) -> bool:
         return bool(self._verifier.wanted)
 
-    def _ranked(self, groups: Mapping[str, SubmapGroup]) -> list[tuple[str, str]]:
-        """Pairs of vehicles, most promising first."""
-        shapes = {vehicle: self._library.shape(group) for vehicle, group in groups.items()}
+    def _ranked(self, groups: Mapping[Track, SubmapGroup]) -> list[Pair]:
+        """Pairs of tracks, most promising first."""
+        shapes = {track: self._library.shape(group) for track, group in groups.items()}
         pairs = itertools.combinations(sorted(groups), 2)
         return sorted(pairs, key=lambda p: (-promise(shapes[p[0]], shapes[p[1]]), p))
 
-    def _match_vehicles(self, pairs: Iterable[tuple[str, str]]) -> list[Constraint]:
+    def _match_tracks(self, pairs: Iterable[Pair]) -> list[Constraint]:
         constraints: list[Constraint] = []
         for target, source in pairs:
             query = Query(self._groups[source], self._groups[target])
-            sides = self._library.vehicle_side(source), self._library.vehicle_side(target)
+            sides = self._library.track_side(source), self._library.track_side(target)
             constraints += self._verifier.constraints_of(query, *sides)
         return constraints
 
-    def _apart(
-        self, constraints: Sequence[Constraint], pairs: Iterable[tuple[str, str]]
-    ) -> list[tuple[str, str]]:
-        """Pairs whose vehicles are in different components."""
+    def _apart(self, constraints: Sequence[Constraint], pairs: Iterable[Pair]) -> list[Pair]:
+        """Pairs whose tracks are in different components."""
         _, components = self._solve(constraints)
         where = component_numbers(components)
         return [(a, b) for a, b in pairs if where[self._group_id(a)] != where[self._group_id(b)]]
 
-    def _group_id(self, vehicle: str) -> SubmapId:
-        return self._groups[vehicle].reference
+    def _group_id(self, track: Track) -> SubmapId:
+        return self._groups[track].reference
 
     def _match_meeting(self, constraints: Sequence[Constraint]) -> list[Constraint]:
-        """Step 3: a prior from the graph for vehicles without a match of their own."""
+        """Step 3: a prior from the graph for tracks without a match of their own."""
         solved, components = self._solve(constraints)
         where = component_numbers(components)
-        matched = {frozenset((j.edge.source[0], j.edge.target[0])) for j in solved if j.is_inlier}
+        matched = {
+            frozenset((j.edge.source.track, j.edge.target.track)) for j in solved if j.is_inlier
+        }
         found: list[Constraint] = []
         for target, source in itertools.combinations(sorted(self._groups), 2):
             index = where[self._group_id(target)]
             if frozenset((source, target)) in matched or index != where[self._group_id(source)]:
                 continue
             component = components[index]
-            sides = [self._library.component_side(component, v) for v in (source, target)]
+            sides = [self._library.component_side(component, t) for t in (source, target)]
             found += self._verifier.constraints_nearby(sides[0], sides[1])
         return found
 
@@ -203,8 +204,8 @@ class _Planner:
         whole = self._library.component_group(target)
         target_shape = self._library.shape(whole)
         groups = self._library.parts(source)
-        vehicles = {i[0] for side in (source, target) for i in side.T_frame_submap}
-        if len(vehicles) > 2 and not is_turned:
+        tracks = {i.track for side in (source, target) for i in side.T_frame_submap}
+        if len(tracks) > 2 and not is_turned:
             groups.append(self._library.component_group(source))
         found = []
         for group in groups:
@@ -224,7 +225,9 @@ class _Planner:
         self, solved: Sequence[Constraint], components: Sequence[Component]
     ) -> list[Constraint]:
         """Standing answers that this plan has not asked for, where it has nothing of its own."""
-        own = {frozenset((j.edge.source[0], j.edge.target[0])) for j in solved if j.is_inlier}
+        own = {
+            frozenset((j.edge.source.track, j.edge.target.track)) for j in solved if j.is_inlier
+        }
         where = component_numbers(components)
         carried: list[Constraint] = []
         for key in sorted(self._standing - self._verifier.visited):
@@ -233,7 +236,7 @@ class _Planner:
                 continue
             constraint = self._verifier.constraint(answer)
             ends = constraint.edge.source, constraint.edge.target
-            is_own = frozenset((ends[0][0], ends[1][0])) in own
+            is_own = frozenset((ends[0].track, ends[1].track)) in own
             is_apart = where[ends[0]] != where[ends[1]]
             if is_apart or (self._is_waiting() and not is_own):
                 carried.append(constraint)
@@ -241,11 +244,15 @@ class _Planner:
 
     def _is_joined(self, constraints: Sequence[Constraint]):  # type: ignore[no-untyped-def]
         joined = {
-            frozenset((j.edge.source[0], j.edge.target[0])) for j in constraints if j.is_inlier
+            frozenset((j.edge.source.track, j.edge.target.track))
+            for j in constraints
+            if j.is_inlier
         }
 
         def key(query: Query) -> bool:
-            return frozenset((query.source.reference[0], query.target.reference[0])) in joined
+            return (
+                frozenset((query.source.reference.track, query.target.reference.track)) in joined
+            )
 
         return key
 
@@ -255,15 +262,15 @@ class _Planner:
         return self._library.solve(self._anchor, constraints)
 
 
-def most_promising(ranked: Sequence[tuple[str, str]], max_partners: int) -> list[tuple[str, str]]:
-    """Of ranked pairs, those that are among the best few of either vehicle."""
-    count: dict[str, int] = {}
-    chosen: list[tuple[str, str]] = []
+def most_promising(ranked: Sequence[Pair], max_partners: int) -> list[Pair]:
+    """Of ranked pairs, those that are among the best few of either track."""
+    count: dict[Track, int] = {}
+    chosen: list[Pair] = []
     for pair in ranked:
-        if min(count.get(vehicle, 0) for vehicle in pair) < max_partners:
+        if min(count.get(track, 0) for track in pair) < max_partners:
             chosen.append(pair)
-            for vehicle in pair:
-                count[vehicle] = count.get(vehicle, 0) + 1
+            for track in pair:
+                count[track] = count.get(track, 0) + 1
     return chosen
 
 

@@ -30,7 +30,7 @@ from uw_dslam_ros2.core.merging.types import (
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["MapQueue"]
 
@@ -52,7 +52,7 @@ class MapQueue:
         self._withdrawn: set[SubmapId] = set()
         self._anchor: SubmapId | None = None
         self._is_pinned = False  # for good: named by the settings, or vehicles are joined in it
-        self._vehicles: list[str] = []
+        self._tracks: list[Track] = []
         self._answers: dict[QueryKey, Answer] = {}
         self._standing: frozenset[QueryKey] = frozenset()
         self._memory: Memory = {}
@@ -85,13 +85,13 @@ class MapQueue:
             is_other = held.fingerprint != stored.fingerprint
             if submap.revision == held.submap.revision and is_other:
                 raise InvalidInputError(
-                    f"submap {submap.vehicle_id}/{submap.sequence} revision {submap.revision} "
+                    f"submap {submap.submap_id} revision {submap.revision} "
                     "differs from the one received before: are there two vehicles of this name?"
                 )
             return False
         self._submaps[submap.submap_id] = stored
-        if submap.vehicle_id not in self._vehicles:
-            self._vehicles.append(submap.vehicle_id)
+        if submap.submap_id.track not in self._tracks:
+            self._tracks.append(submap.submap_id.track)
         wanted = self._config.anchor_vehicle
         if self._anchor is None and wanted in ("", submap.vehicle_id):
             self._pin(submap.submap_id)
@@ -173,7 +173,7 @@ class MapQueue:
         return True
 
     def submaps(self) -> list[SubmapRecord]:
-        """All submaps, by vehicle and sequence."""
+        """All submaps, by vehicle, run and sequence."""
         answers = list(self._answers.values())
         return records_of(self._submaps, self._withdrawn, self._plan(), self._anchor, answers)
 
@@ -216,22 +216,33 @@ class MapQueue:
         return None if drawn is None else drawn.take_changed()
 
     def T_map_odom(self, vehicle_id: str) -> SE2 | None:  # noqa: N802 (notation of motions)
-        """Place of a vehicle's odom frame, from its newest submap; None unless it is merged."""
+        """Place of the odom frame of a vehicle's newest run; None unless that run is merged."""
         merged = self._merged()
-        newest = max((i for i in merged if i[0] == vehicle_id), default=None)
+        track = Track(vehicle_id, self.newest_run(vehicle_id))
+        newest = max((i for i in merged if i.track == track), default=None)
         if newest is None:
             return None
         return merged[newest] @ self._submaps[newest].submap.T_odom_submap.inverse()
 
+    def newest_run(self, vehicle_id: str) -> int:
+        """Run of a vehicle that was heard of last; 0 without any."""
+        runs = [track.run_id for track in self._tracks if track.vehicle_id == vehicle_id]
+        return runs[-1] if runs else 0
+
     def trajectories(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Of each merged vehicle: stamps (K,) [ns] and poses (K, 3) [x, y, yaw] in "map"."""
+        """Of each vehicle: stamps (K,) [ns] and poses (K, 3) [x, y, yaw] in "map".
+
+        All its runs that are merged are in it.
+        """
         merged = self._merged()
         parts: dict[str, list[tuple[NDArray[np.int64], NDArray[np.float64]]]] = {}
         for submap_id in sorted(merged):
             submap = self._submaps[submap_id].submap
             if len(submap.trajectory):
                 poses = _moved(merged[submap_id], submap.trajectory)
-                parts.setdefault(submap_id[0], []).append((submap.trajectory_stamp_ns, poses))
+                parts.setdefault(submap_id.vehicle_id, []).append(
+                    (submap.trajectory_stamp_ns, poses)
+                )
         return {vehicle: _by_time(pieces) for vehicle, pieces in parts.items()}
 
     def to_state(self) -> QueueState:
@@ -242,7 +253,7 @@ class MapQueue:
             tuple(self._answers[key] for key in sorted(self._answers)),
             self._anchor,
             self._lattice,
-            tuple(self._vehicles),
+            tuple(self._tracks),
             self._next_request_id,
             self._standing,
             self._is_pinned,
@@ -260,7 +271,7 @@ class MapQueue:
         queue._standing = frozenset(state.standing)
         queue._anchor, queue._lattice = state.anchor, state.lattice
         queue._is_pinned = state.is_pinned
-        queue._vehicles = list(state.vehicles)
+        queue._tracks = list(state.tracks)
         queue._next_request_id = state.next_request_id
         return queue
 
@@ -290,7 +301,7 @@ class MapQueue:
             if self._config.mode == "pairwise":
                 plan = make_pairwise_plan(
                     library,
-                    self._vehicles,
+                    self._tracks,
                     self._answers,
                     anchor,
                     is_growing=self._is_growing,
@@ -311,14 +322,14 @@ class MapQueue:
         """Pin the frame where vehicles are joined, once nothing is open; True if that moves it."""
         if self._is_pinned or self._is_growing or plan.wanted or self._in_flight:
             return False
-        joined = [part for part in plan.components if len({i[0] for i in part}) > 1]
+        joined = [part for part in plan.components if len({i.track for i in part}) > 1]
         if not joined:
             return False
         self._is_pinned = True
         if any(self._anchor in part for part in joined):
             return False
-        largest = max(joined, key=lambda part: (len({i[0] for i in part}), len(part)))
-        self._pin(min(largest, key=lambda i: (self._vehicles.index(i[0]), i[1])))
+        largest = max(joined, key=lambda part: (len({i.track for i in part}), len(part)))
+        self._pin(min(largest, key=lambda i: (self._tracks.index(i.track), i.sequence)))
         return True
 
     def _pin(self, submap_id: SubmapId) -> None:

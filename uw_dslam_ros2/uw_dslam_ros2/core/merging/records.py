@@ -15,7 +15,7 @@ from uw_dslam_ros2.core.merging.types import (
     SubmapState,
 )
 from uw_dslam_ros2.core.pose_graph import residual
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["constraints_of", "records_of"]
 
@@ -27,7 +27,7 @@ def records_of(
     anchor: SubmapId | None,
     answers: Sequence[Answer],
 ) -> list[SubmapRecord]:
-    """All submaps, by vehicle and sequence."""
+    """All submaps, by vehicle, run and sequence."""
     first = 0 if anchor is not None else 1
     number = component_numbers(plan.components)
     tries = _num_tries(answers)
@@ -39,14 +39,14 @@ def records_of(
         elif component == 0:
             state, reason = SubmapState.MERGED, _merge_reason(submap_id, anchor, plan)
         else:
-            state, reason = SubmapState.WAITING, _wait_reason(submap_id[0], answers)
+            state, reason = SubmapState.WAITING, _wait_reason(submap_id.track, answers)
         records.append(
             SubmapRecord(
                 submaps[submap_id].submap,
                 state,
                 component,
                 plan.components[number[submap_id]][submap_id],
-                tries.get(submap_id[0], 0),
+                tries.get(submap_id.track, 0),
                 reason,
             )
         )
@@ -84,37 +84,39 @@ def _merge_reason(submap_id: SubmapId, anchor: SubmapId | None, plan: Plan) -> s
     assert anchor is not None
     if submap_id == anchor:
         return "pins the global frame"
-    if submap_id[0] == anchor[0]:
+    if submap_id.track == anchor.track:
         return "odometry from the submap that pins the global frame"
     own = [
         constraint
         for constraint in plan.constraints
         if constraint.is_inlier
-        and submap_id[0] in (constraint.edge.source[0], constraint.edge.target[0])
+        and submap_id.track in (constraint.edge.source.track, constraint.edge.target.track)
     ]
-    partners = {
-        i[0] for constraint in own for i in (constraint.edge.source, constraint.edge.target)
-    }
-    reason = f"registered with {', '.join(sorted(partners - {submap_id[0]}))}"
+    ends = {i for constraint in own for i in (constraint.edge.source, constraint.edge.target)}
+    partners = {i.track for i in ends} - {submap_id.track}
+    names = sorted({t.vehicle_id for t in partners if t.vehicle_id != submap_id.vehicle_id})
+    if any(t.vehicle_id == submap_id.vehicle_id for t in partners):
+        names.append("another run of its own")
+    reason = f"registered with {', '.join(names)}"
     if own and all(constraint.is_unsure for constraint in own):
         reason += ", by several answers that are unsure alone and agree"
     return reason
 
 
-def _wait_reason(vehicle: str, answers: Sequence[Answer]) -> str:
+def _wait_reason(track: Track, answers: Sequence[Answer]) -> str:
     reasons = [
         answer.why
         for answer in answers
         if not answer.is_accepted
-        and vehicle in (answer.query.source.reference[0], answer.query.target.reference[0])
+        and track in (answer.query.source.reference.track, answer.query.target.reference.track)
     ]
     return reasons[-1] if reasons else "not matched yet"
 
 
-def _num_tries(answers: Sequence[Answer]) -> dict[str, int]:
-    tries: dict[str, int] = {}
+def _num_tries(answers: Sequence[Answer]) -> dict[Track, int]:
+    tries: dict[Track, int] = {}
     for answer in answers:
         for group in (answer.query.source, answer.query.target):
-            for vehicle in {submap_id[0] for submap_id in group.ids}:
-                tries[vehicle] = tries.get(vehicle, 0) + 1
+            for track in {submap_id.track for submap_id in group.ids}:
+                tries[track] = tries.get(track, 0) + 1
     return tries

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from uw_dslam_ros2.core.grid import GridSpec
 from uw_dslam_ros2.core.merging.answers import Answer, QueryKey
-from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["QueueState"]
 
@@ -19,14 +19,14 @@ class QueueState:
     """
 
     submaps: tuple[Submap, ...]
-    """Newest revision of each, by vehicle and sequence."""
+    """Newest revision of each, by vehicle, run and sequence."""
     withdrawn: frozenset[SubmapId]
     answers: tuple[Answer, ...]
     anchor: SubmapId | None
     """Submap that pins the global frame."""
     lattice: GridSpec | None
     """Its cells, as the lattice of the global map."""
-    vehicles: tuple[str, ...]
+    tracks: tuple[Track, ...]
     """In order of first arrival."""
     next_request_id: int
     standing: frozenset[QueryKey]

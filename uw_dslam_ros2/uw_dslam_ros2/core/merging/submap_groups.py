@@ -17,7 +17,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap, SubmapId
 
 __all__ = ["StoredSubmap", "SubmapGroup", "render_group", "shared_area_m2"]
 
@@ -95,9 +95,10 @@ class SubmapGroup:
             relative = SE2() if index == reference else T_reference_frame @ motion
             rounded = SE2.from_array(np.round(relative.as_array(), 6))
             poses[member.submap.submap_id] = rounded
-            hasher.update(repr((member.submap.submap_id, rounded)).encode() + member.digest)
+            name = f"({member.submap.submap_id.stable_name}, {rounded!r})"
+            hasher.update(name.encode() + member.digest)
         reference_id = members[reference].submap.submap_id
-        hasher.update(repr(reference_id).encode())
+        hasher.update(reference_id.stable_name.encode())
         return cls(reference_id, poses, hasher.digest())
 
     @property
@@ -143,13 +144,15 @@ def _thinned(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
 
 
 def _check(submap: Submap, max_cells: int) -> None:
-    name = f"submap {submap.vehicle_id}/{submap.sequence}"
+    name = f"submap {submap.submap_id}"
     if not submap.vehicle_id:
         raise InvalidInputError("submap has an empty vehicle_id, expected the vehicle's name")
     if submap.sequence < 0 or submap.revision < 0:
         raise InvalidInputError(
             f"{name}: sequence {submap.sequence}, revision {submap.revision}, expected >= 0"
         )
+    if not 0 <= submap.run_id <= MAX_RUN_ID:
+        raise InvalidInputError(f"{name}: run_id is {submap.run_id}, expected 0 to {MAX_RUN_ID}")
     covariance = np.asarray(submap.covariance)
     if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
         raise InvalidInputError(f"{name}: covariance is {covariance}, expected (3, 3) finite")

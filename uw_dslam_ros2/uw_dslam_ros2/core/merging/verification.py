@@ -26,7 +26,7 @@ from uw_dslam_ros2.core.merging.voting import ENOUGH_ODDS, Vote, vote_of, weigh
 from uw_dslam_ros2.core.pose_graph import invert_covariance
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["Verifier"]
 
@@ -96,7 +96,7 @@ class Verifier:
         return []
 
     def constraints_nearby(self, source: Side, target: Side) -> list[Constraint]:
-        """Constraints between two vehicles of one component, where the graph lets them meet."""
+        """Constraints between two tracks of one component, where the graph lets them meet."""
         checks = self._checks(None, None, SE2(), source, target)[:MAX_CHECKS]
         replies = self._ask_all(checks)
         if replies is None:
@@ -121,12 +121,12 @@ class Verifier:
         places = vague_places(
             self._library, side, edges, NUM_NEIGHBOURS, vague_cells, limit, chosen
         )
-        groups: dict[frozenset[str], list[Query]] = {}
+        groups: dict[frozenset[Track], list[Query]] = {}
         for ends, uncertainty in places:
             check = self._check(ends, side.between(ends[1], ends[0]), uncertainty)
-            groups.setdefault(frozenset((ends[0][0], ends[1][0])), []).append(check)
+            groups.setdefault(frozenset((ends[0].track, ends[1].track)), []).append(check)
         found: list[Constraint] = []
-        for vehicles, checks in sorted(groups.items(), key=lambda item: sorted(item[0])):
+        for tracks, checks in sorted(groups.items(), key=lambda item: sorted(item[0])):
             replies = self._ask_all(checks)
             if replies is None:
                 continue
@@ -134,7 +134,7 @@ class Verifier:
             old = [
                 Vote(constraint, None, is_accepted=True)
                 for constraint in inside
-                if {constraint.edge.source[0], constraint.edge.target[0]} == vehicles
+                if {constraint.edge.source.track, constraint.edge.target.track} == tracks
             ]
             keys = {vote.constraint.key for vote in new}
             believed, _ = self._weigh([*old, *new], len(replies), side, side)

@@ -24,7 +24,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mounting import rotation_of_quaternion
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = [
     "check_covariance",
@@ -257,18 +257,19 @@ def occupancy_to_msg(occupancy: OccupancyMap, frame_id: str, stamp_ns: int) -> O
 # --- submaps ---------------------------------------------------------------------------------
 
 
-def submap_frame_id(vehicle_id: str, sequence: int) -> str:
+def submap_frame_id(submap_id: SubmapId) -> str:
     """Frame of a submap."""
-    return f"{vehicle_id}/submap_{sequence}"
+    return f"{submap_id.vehicle_id}/submap_{submap_id.sequence}"
 
 
 def submap_to_msg(submap: Submap) -> SubmapMsg:
     """Message of a submap."""
-    frame_id = submap_frame_id(submap.vehicle_id, submap.sequence)
+    frame_id = submap_frame_id(submap.submap_id)
     msg = SubmapMsg()
     msg.header.frame_id = frame_id
     msg.header.stamp = stamp_to_msg(submap.stamp_ns)
     msg.vehicle_id = submap.vehicle_id
+    msg.run_id = int(submap.run_id)
     msg.sequence = int(submap.sequence)
     msg.revision = int(submap.revision)
     msg.is_final = bool(submap.is_final)
@@ -309,4 +310,5 @@ def submap_from_msg(msg: SubmapMsg) -> Submap:
         points=points,
         trajectory=np.array(trajectory, dtype=np.float64).reshape(-1, 3),
         trajectory_stamp_ns=np.array(stamps_ns, dtype=np.int64),
+        run_id=int(msg.run_id),
     )

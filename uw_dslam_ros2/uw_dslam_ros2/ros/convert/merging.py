@@ -45,6 +45,7 @@ def record_to_msg(record: SubmapRecord) -> SubmapInfo:
     """What the queue knows of one submap."""
     return SubmapInfo(
         vehicle_id=record.submap.vehicle_id,
+        run_id=int(record.submap.run_id),
         sequence=int(record.submap.sequence),
         revision=int(record.submap.revision),
         is_final=bool(record.submap.is_final),
@@ -60,10 +61,12 @@ def constraint_to_msg(constraint: Constraint) -> ConstraintMsg:
     """One edge of the pose graph."""
     return ConstraintMsg(
         kind=int(constraint.kind),
-        source_vehicle_id=constraint.source[0],
-        source_sequence=int(constraint.source[1]),
-        target_vehicle_id=constraint.target[0],
-        target_sequence=int(constraint.target[1]),
+        source_vehicle_id=constraint.source.vehicle_id,
+        source_run_id=int(constraint.source.run_id),
+        source_sequence=int(constraint.source.sequence),
+        target_vehicle_id=constraint.target.vehicle_id,
+        target_run_id=int(constraint.target.run_id),
+        target_sequence=int(constraint.target.sequence),
         t_target_source=transform2d_to_msg(constraint.T_target_source),
         covariance=covariance_to_list(constraint.covariance),
         residual_m=float(constraint.residual_m),
@@ -89,15 +92,15 @@ def graph_to_markers(
         if record.component == 0 and record.state == SubmapState.MERGED
     }
     markers = [_marker(frame_id, stamp, "clear", 0, Marker.DELETEALL)]
-    vehicles = sorted({vehicle_id for vehicle_id, _ in merged})
+    vehicles = sorted({submap_id.vehicle_id for submap_id in merged})
     for index, vehicle_id in enumerate(vehicles):
         color = _VEHICLE_COLORS[index % len(_VEHICLE_COLORS)]
         nodes = _marker(frame_id, stamp, "submaps", index, Marker.ADD, Marker.SPHERE_LIST)
         nodes.scale.x = nodes.scale.y = nodes.scale.z = _NODE_SIZE_M
         nodes.color = _color(color)
-        nodes.points = [_point(T) for (name, _), T in merged.items() if name == vehicle_id]
+        nodes.points = [_point(T) for i, T in merged.items() if i.vehicle_id == vehicle_id]
         label = _marker(frame_id, stamp, "names", index, Marker.ADD, Marker.TEXT_VIEW_FACING)
-        first = min(submap_id for submap_id in merged if submap_id[0] == vehicle_id)
+        first = min(submap_id for submap_id in merged if submap_id.vehicle_id == vehicle_id)
         label.pose.position.x = merged[first].x
         label.pose.position.y = merged[first].y
         label.pose.position.z = _TEXT_HEIGHT_M

@@ -31,7 +31,11 @@ from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.session import load_session, save_session
-from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg, submap_from_msg
+from uw_dslam_ros2.ros.convert.core_types import (
+    occupancy_to_msg,
+    submap_frame_id,
+    submap_from_msg,
+)
 from uw_dslam_ros2.ros.convert.merging import (
     constraint_to_msg,
     graph_to_markers,
@@ -172,7 +176,7 @@ class MapQueueManager(Node):
             self._counts["num_repeated"] += 1
             return
         self._idle.note(time.monotonic())
-        self.changed(f"{submap.vehicle_id}/{submap.sequence} revision {submap.revision} received")
+        self.changed(f"{submap.submap_id} revision {submap.revision} received")
 
     def changed(self, message: str) -> None:
         """Note that the queue was changed."""
@@ -220,7 +224,10 @@ class MapQueueManager(Node):
             # the number of boxes decides, and this is for what never ends.
             max_seconds = _SEARCH_SHARE * self._config.request_timeout_s
             msg = RegisterMaps.Request(options=options_to_msg(request.prior, max_seconds))
-            frames = (_frame_of(request.source_reference), _frame_of(request.target_reference))
+            frames = (
+                submap_frame_id(request.source_reference),
+                submap_frame_id(request.target_reference),
+            )
             msg.source = occupancy_to_msg(request.source, frames[0], 0)
             msg.target = occupancy_to_msg(request.target, frames[1], 0)
             if self._servers.ask(request.request_id, msg, self._on_answer):
@@ -378,12 +385,8 @@ def _unanswered(reason: str) -> RegistrationResult:
     return RegistrationResult.refused(Verdict.BUDGET_EXHAUSTED, reason)
 
 
-def _frame_of(submap_id: SubmapId) -> str:
-    return f"{submap_id[0]}/submap_{submap_id[1]}"
-
-
 def _names(submap_ids: Sequence[SubmapId]) -> str:
-    first = f"{submap_ids[0][0]}/{submap_ids[0][1]}"
+    first = str(submap_ids[0])
     return first if len(submap_ids) == 1 else f"{first} and {len(submap_ids) - 1} more"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import secrets
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -21,7 +22,7 @@ from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
 from uw_dslam_ros2.io.conventions import correct, correct_mounting
 from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed
@@ -81,7 +82,7 @@ class SonarMapper(Node):
                 "give one of them (-r __ns:=/auv_1)"
             )
         self._base_frame = self._config.base_frame or f"{self._vehicle_id}/base_link"
-        self._mapper = VehicleMapper(self._mapper_config, self._vehicle_id)
+        self._mapper = self._new_mapper()
         self._order: StampOrder[SensorEvent] = StampOrder(
             int(self._reorder_s() * 1e9), int(_JUMP_BACK_S * 1e9)
         )
@@ -258,9 +259,14 @@ class SonarMapper(Node):
             if self.count_publishers(sensor.topic):
                 self._order.expect(sensor.name, stamp_ns - 1)  # its own may be of the same moment
 
+    def _new_mapper(self) -> VehicleMapper:
+        """A mapper for a new run: two that start in the same moment are told apart, too."""
+        run_id = 1 + secrets.randbelow(MAX_RUN_ID)
+        return VehicleMapper(self._mapper_config, self._vehicle_id, run_id)
+
     def _restart(self) -> None:
         self._order.clear()
-        self._mapper = VehicleMapper(self._mapper_config, self._vehicle_id)
+        self._mapper = self._new_mapper()
         self._odom_stamp_ns = self._map_stamp_ns = 0
         self._is_finished = False
         self._counts["num_restarts"] += 1

@@ -166,5 +166,7 @@ class MissionControl:
 
 
 def _progress_of(status: MergeStatus) -> tuple[Any, ...]:
-    revisions = tuple((s.vehicle_id, s.sequence, s.revision, s.state) for s in status.submaps)
+    revisions = tuple(
+        (s.vehicle_id, s.run_id, s.sequence, s.revision, s.state) for s in status.submaps
+    )
     return status.num_registrations, status.num_components, revisions

@@ -116,7 +116,7 @@ class QueueServices:
         ]
 
     def _get_submap(self, request: GetSubmap.Request, response: GetSubmap.Response) -> None:
-        submap_id = (request.vehicle_id, int(request.sequence))
+        submap_id = self._submap_id(request)
         for record in self._owner.queue.submaps():
             if record.submap.submap_id == submap_id:
                 response.result = response.DONE
@@ -125,6 +125,11 @@ class QueueServices:
                 return
         response.result = response.NOT_FOUND
         response.message = _not_found(submap_id)
+
+    def _submap_id(self, request: Any) -> SubmapId:
+        """Which submap is meant; without a run that of the vehicle's newest one."""
+        run_id = int(request.run_id) or self._owner.queue.newest_run(request.vehicle_id)
+        return SubmapId(request.vehicle_id, run_id, int(request.sequence))
 
     def _withdraw_submap(self, request: Any, response: Any) -> None:
         self._switch(request, response, self._owner.queue.withdraw, "withdrawn")
@@ -135,12 +140,12 @@ class QueueServices:
     def _switch(
         self, request: Any, response: Any, act: Callable[[SubmapId], bool], word: str
     ) -> None:
-        submap_id = (request.vehicle_id, int(request.sequence))
+        submap_id = self._submap_id(request)
         if not act(submap_id):
             response.result, response.message = response.NOT_FOUND, _not_found(submap_id)
             return
         response.result = response.DONE
-        response.message = f"{request.vehicle_id}/{request.sequence} {word}"
+        response.message = f"{submap_id} {word}"
         self._owner.changed(response.message)
 
     def _save_session(self, request: SaveSession.Request, response: SaveSession.Response) -> None:
@@ -175,4 +180,4 @@ def has_session(path: str) -> bool:
 
 
 def _not_found(submap_id: SubmapId) -> str:
-    return f"no submap {submap_id[0]}/{submap_id[1]}; ~/list_submaps lists them"
+    return f"no submap {submap_id}; ~/list_submaps lists them"
