@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 from places import room_submap
@@ -31,6 +32,7 @@ from visualization_msgs.msg import MarkerArray
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.provenance import read_provenance
+from uw_dslam_ros2.io.session import SessionInUseError, has_session, load_session
 from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, submap_to_msg
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
@@ -310,6 +312,40 @@ def test_session_parameter_resumes_by_itself(manage, tmp_path):
         until(lambda: probe.num_merged == 1, "the submap")
     with manage(has_server=False, session=folder, **FAST) as (until, probe, _):
         until(lambda: probe.num_merged == 1, "the resumed session")
+
+
+def test_a_disk_that_is_away_stops_nothing_and_is_used_when_back(manage, tmp_path):
+    disk = tmp_path / "disk"
+    disk.write_text("not mounted")
+    statuses = []
+
+    def on_diagnostics(msg):
+        statuses.extend(s for s in msg.status if s.name.startswith("map_queue_manager"))
+
+    with manage(session=str(disk / "session"), **FAST) as (until, probe, call):
+        probe.node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
+        for submap in two_submaps():
+            probe.send(submap)
+        until(lambda: probe.num_merged == 2, "the merge")
+        until(lambda: probe.maps, "the map")
+        until(lambda: statuses and statuses[-1].level == DiagnosticStatus.ERROR, "the report")
+        assert "cannot write to the session" in statuses[-1].message
+        disk.unlink()
+        until(lambda: has_session(disk / "session"), "the save")
+        until(lambda: statuses[-1].level == DiagnosticStatus.OK, "all well")
+        saved = call(SaveSession, "save_session", path=str(disk / "session"))
+        assert saved.result == SaveSession.Response.DONE, saved.message
+    assert len(load_session(disk / "session").submaps()) == 2
+
+
+def test_two_managers_do_not_share_a_session(manage, ros_context, tmp_path):
+    settings = {"session": str(tmp_path / "session"), **FAST}
+    with manage(has_server=False, **settings) as (until, probe, _):
+        probe.send(room_submap("auv_1"))
+        until(lambda: probe.num_merged == 1, "the submap")
+        parameters = [Parameter("session", value=settings["session"])]
+        with pytest.raises(SessionInUseError, match="give each manager a folder"):
+            MapQueueManager(context=ros_context, parameter_overrides=parameters)
 
 
 def test_what_is_left_is_asked_when_told_to_settle(manage):

@@ -1,20 +1,26 @@
 """Sessions: what a map queue knows, kept on disk so that it outlives the process.
 
 A session is a folder with an SQLite file. Saving writes what is new in one transaction: a process
-that is killed at any point leaves the session as it was before or as it is after.
+that is killed at any point leaves the session as it was before or as it is after. Beside it lie
+the state of the last start, for when the file is damaged, and the lock of who is writing.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
-import io
 import json
+import logging
+import os
+import shutil
+import socket
 import sqlite3
-import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,61 +32,197 @@ from uw_dslam_ros2.core.merging.answers import Answer, Query
 from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap, SubmapId, Track, track_name
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
+from uw_dslam_ros2.io.array_files import arrays_from_bytes, arrays_to_bytes
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
+from uw_dslam_ros2.io.session_file import (
+    FIRST_VERSION,
+    VERSION,
+    Record,
+    opened,
+    read_records,
+    write_records,
+)
 from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum
 
-__all__ = ["SESSION_FILE", "UNSURE_EDGE", "export_queue", "load_session", "save_session"]
+__all__ = [
+    "GOOD_FILE",
+    "SESSION_FILE",
+    "UNSURE_EDGE",
+    "Session",
+    "SessionInUseError",
+    "export_queue",
+    "has_session",
+    "load_session",
+    "save_session",
+]
 
 SESSION_FILE = "session.sqlite"
+GOOD_FILE = "session.good.sqlite"
+"""Copy of the session as it was read, whole, at the last start."""
 UNSURE_EDGE = "refused by itself; believed because others agree with it"
 """Comment on an edge of a pose graph."""
-_VERSION = 1
-_TABLES = """
-CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS submaps (
-    vehicle_id TEXT, run_id INTEGER, sequence INTEGER, digest BLOB NOT NULL,
-    content BLOB NOT NULL, PRIMARY KEY (vehicle_id, run_id, sequence));
-CREATE TABLE IF NOT EXISTS withdrawn (
-    vehicle_id TEXT, run_id INTEGER, sequence INTEGER,
-    PRIMARY KEY (vehicle_id, run_id, sequence));
-CREATE TABLE IF NOT EXISTS answers (digest BLOB PRIMARY KEY, content TEXT NOT NULL);
-"""
+_LOCK_FILE = "session.lock"
+_MAX_NAME = 80
+_EXTRA_BYTES = 1 << 26
+"""Beyond the cells of its grid, what a submap may hold: points and path."""
+
+
+class SessionInUseError(DataError):
+    """Another process is writing the session."""
+
+
+class Session:
+    """A session's folder, which one process at a time may write.
+
+    Parameters
+    ----------
+    folder
+        Made by the first save where it is missing.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self._folder = Path(folder)
+        self._lock: IO[str] | None = None
+        # Saving looks at all submaps; what did not change need not be hashed again.
+        self._digests: dict[SubmapId, tuple[Submap, bytes]] = {}
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def load(self, config: MapQueueConfig | None = None) -> MapQueue | None:
+        """Go on from what is saved; None where nothing is. Keeps a copy of it.
+
+        Raises
+        ------
+        SessionInUseError
+            If another process has the folder.
+        DataError
+            Naming the file, the records that are damaged, and where the copy of the last start is.
+        """
+        try:
+            self._acquire()
+        except SessionInUseError:
+            raise
+        except DataError as error:
+            logging.getLogger(__name__).warning("%s", error)  # readable all the same
+        if not has_session(self._folder):
+            return None
+        queue = load_session(self._folder, config)
+        if self._lock is not None:
+            self._keep_copy()
+        return queue
+
+    def save(self, queue: MapQueue) -> Path:
+        """Make the session equal to the queue; costs what has changed since the last time.
+
+        Returns
+        -------
+        Path
+            The session's file.
+
+        Raises
+        ------
+        SessionInUseError
+            If another process has the folder.
+        DataError
+            Naming the file and the reason; the session is then as it was.
+        """
+        self._acquire()
+        path = self._folder / SESSION_FILE
+        try:
+            write_records(path, self._records(queue.to_state()))
+        except (sqlite3.Error, OSError) as error:
+            raise DataError(f"cannot save the session {path}: {error}") from error
+        return path
+
+    def close(self) -> None:
+        """Let others have the folder."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def _acquire(self) -> None:
+        path = self._folder / _LOCK_FILE
+        if self._lock is not None and _is_same_file(self._lock, path):
+            return
+        self.close()
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            lock = path.open("a+")
+        except OSError as error:
+            raise DataError(f"cannot write to the session {self._folder}: {error}") from error
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.seek(0)
+            holder = lock.read(200).strip() or "another process"
+            lock.close()
+            raise SessionInUseError(
+                f"the session {self._folder} is written by {holder}; give each manager a folder "
+                "of its own"
+            ) from None
+        self._lock = lock
+        with contextlib.suppress(OSError):  # on a full disk: it names us to others, no more
+            lock.truncate(0)
+            lock.write(f"process {os.getpid()} on {socket.gethostname()}")
+            lock.flush()
+
+    def _keep_copy(self) -> None:
+        copy = self._folder / GOOD_FILE
+        new = copy.with_suffix(".tmp")
+        try:
+            shutil.copyfile(self._folder / SESSION_FILE, new)
+            new.replace(copy)
+        except OSError as error:
+            new.unlink(missing_ok=True)
+            logging.getLogger(__name__).warning("cannot copy the session to %s: %s", copy, error)
+
+    def _records(self, state: QueueState) -> dict[tuple[str, str], Record]:
+        records: dict[tuple[str, str], Record] = {}
+        digests: dict[SubmapId, tuple[Submap, bytes]] = {}
+        for submap in state.submaps:
+            held = self._digests.get(submap.submap_id)
+            digest = held[1] if held and held[0] is submap else _submap_digest(submap)
+            digests[submap.submap_id] = submap, digest
+            records["submap", json.dumps(submap.submap_id)] = Record(
+                digest, partial(_submap_to_bytes, submap)
+            )
+        self._digests = digests
+        for submap_id in state.withdrawn:
+            records["withdrawn", json.dumps(submap_id)] = Record.of(b"")
+        for answer in state.answers:
+            digest = _answer_digest(answer)
+            records["answer", digest.hex()] = Record(digest, partial(_answer_to_bytes, answer))
+        for name, value in _meta(state).items():
+            records["meta", name] = Record.of(json.dumps(value).encode())
+        return records
 
 
 def save_session(folder: str | Path, queue: MapQueue) -> Path:
-    """Make the session in a folder equal to the queue; costs what has changed since the last time.
+    """Save once, see `Session.save`."""
+    with Session(folder) as session:
+        return session.save(queue)
 
-    Returns
-    -------
-    Path
-        The session's file.
 
-    Raises
-    ------
-    DataError
-        Naming the file and the reason; the session is then as it was.
-    """
+def has_session(folder: str | Path) -> bool:
+    """Whether something is saved in a folder, be it whole or not."""
     path = Path(folder) / SESSION_FILE
+    if not path.is_file():
+        return False
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _opened(path) as connection:
-            _create(connection, path)
-            connection.execute("BEGIN IMMEDIATE")
-            try:
-                _write(connection, queue.to_state())
-                connection.execute("COMMIT")
-            except BaseException:
-                connection.rollback()
-                raise
-    except (sqlite3.Error, OSError) as error:
-        raise DataError(f"cannot save the session {path}: {error}") from error
-    return path
+        with opened(path) as (_, version):
+            return version != 0
+    except sqlite3.Error:
+        return True
 
 
 def load_session(folder: str | Path, config: MapQueueConfig | None = None) -> MapQueue:
-    """Go on from a saved session.
+    """Read a saved session; nothing is written.
 
     Raises
     ------
@@ -88,15 +230,24 @@ def load_session(folder: str | Path, config: MapQueueConfig | None = None) -> Ma
         Naming the file and what is wrong with it.
     """
     path = Path(folder) / SESSION_FILE
-    if not path.is_file():
-        raise DataError(f"there is no session: {path} does not exist")
+    if not has_session(folder):
+        raise DataError(f"there is no session: {path} does not exist, or holds nothing yet")
+    max_bytes = (config or MapQueueConfig()).max_submap_cells + _EXTRA_BYTES
     try:
-        with _opened(path) as connection:
-            _check_version(connection, path)
-            state = _read(connection)
+        with opened(path) as (connection, version):
+            if version == FIRST_VERSION:
+                state = _read_first_version(connection, max_bytes)
+            elif version == VERSION:
+                state = _state(read_records(connection), max_bytes)
+            else:
+                raise DataError(f"it is of format {version}, expected {VERSION}")
         return MapQueue.from_state(state, config)
-    except (sqlite3.Error, zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path} is not a whole session: {error}") from error
+    except (sqlite3.Error, OSError, KeyError, TypeError, ValueError, OverflowError) as error:
+        good = path.with_name(GOOD_FILE)
+        remedy = f"; {good} is as it was at the last start: it may be put in its place"
+        raise DataError(
+            f"{path} is not a whole session: {error}{remedy if good.is_file() else ''}"
+        ) from error
 
 
 def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
@@ -118,7 +269,7 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
     records = queue.submaps()
     for record in records:
         submap = record.submap
-        name = f"{_file_name(track_name(submap.submap_id.track))}_{submap.sequence:04d}"
+        name = f"{_file_name(*submap.submap_id.track)}_{submap.sequence:04d}"
         written += write_map(folder / "submaps" / name, submap.grid)
     for vehicle, (stamps_ns, poses) in queue.trajectories().items():
         path = folder / "trajectories" / f"{_file_name(vehicle)}.tum"
@@ -146,55 +297,30 @@ def _regular(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     return covariance + np.diag([1e-6, 1e-6, 1e-8])
 
 
-def _file_name(vehicle_id: str) -> str:
-    """Keep a vehicle's name from leaving its folder."""
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in vehicle_id).lstrip(".") or "_"
+def _file_name(vehicle_id: str, run_id: int = 0) -> str:
+    """Name for a vehicle's files: different for different vehicles, short, and in its folder."""
+    # Percent signs come from quoting alone, hence mark what stands for more than itself.
+    name = quote(vehicle_id, safe="")
+    if name.startswith("."):
+        name = f"%2E{name[1:]}"
+    if len(name) > _MAX_NAME:
+        name = (
+            f"{name[:_MAX_NAME]}%{hashlib.blake2b(vehicle_id.encode(), digest_size=8).hexdigest()}"
+        )
+    name = name or "%"
+    return name if run_id <= 1 else f"{name}#{run_id}"
 
 
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    connection = sqlite3.connect(path, isolation_level=None)
+def _is_same_file(file: IO[str], path: Path) -> bool:
+    """Whether an open file is still what the path names: its disk may have been exchanged."""
     try:
-        yield connection
-    finally:
-        connection.close()
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        return False
 
 
-def _create(connection: sqlite3.Connection, path: Path) -> None:
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    columns = [row[1] for row in connection.execute("PRAGMA table_info(submaps)")]
-    if version == 0 or "run_id" not in columns:
-        connection.execute("BEGIN IMMEDIATE")
-        if version:
-            # From before there were runs. All is written anew, in the same transaction or none.
-            connection.execute("DROP TABLE submaps")
-            connection.execute("DROP TABLE withdrawn")
-        for statement in filter(str.strip, _TABLES.split(";")):
-            connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {_VERSION}")
-        connection.execute("COMMIT")
-    _check_version(connection, path)
-
-
-def _check_version(connection: sqlite3.Connection, path: Path) -> None:
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if version != _VERSION:
-        raise DataError(f"{path} is a session of format {version}, expected {_VERSION}")
-
-
-def _write(connection: sqlite3.Connection, state: QueueState) -> None:
-    _write_submaps(connection, state)
-    connection.execute("DELETE FROM withdrawn")
-    for submap_id in sorted(state.withdrawn):
-        connection.execute("INSERT INTO withdrawn VALUES (?, ?, ?)", submap_id)
-    held = {row[0] for row in connection.execute("SELECT digest FROM answers")}
-    wanted = {_answer_digest(answer): answer for answer in state.answers}
-    for digest in sorted(held - set(wanted)):
-        connection.execute("DELETE FROM answers WHERE digest = ?", (digest,))
-    for digest in sorted(set(wanted) - held):
-        content = json.dumps(_answer_to_plain(wanted[digest]))
-        connection.execute("INSERT INTO answers VALUES (?, ?)", (digest, content))
-    meta = {
+def _meta(state: QueueState) -> dict[str, Any]:
+    return {
         "anchor": state.anchor,
         "lattice": None if state.lattice is None else _spec_to_plain(state.lattice),
         "vehicles": state.tracks,
@@ -202,33 +328,52 @@ def _write(connection: sqlite3.Connection, state: QueueState) -> None:
         "standing": [[s.hex(), t.hex(), prior] for s, t, prior in sorted(state.standing)],
         "is_pinned": state.is_pinned,
     }
-    for name, value in meta.items():
-        row = name, json.dumps(value)
-        connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", row)
 
 
-def _write_submaps(connection: sqlite3.Connection, state: QueueState) -> None:
-    rows = connection.execute("SELECT vehicle_id, run_id, sequence, digest FROM submaps")
-    held = {SubmapId(*name): digest for *name, digest in rows}
-    for submap_id in sorted(set(held) - {submap.submap_id for submap in state.submaps}):
-        where = "WHERE vehicle_id = ? AND run_id = ? AND sequence = ?"
-        connection.execute(f"DELETE FROM submaps {where}", submap_id)
-    for submap in state.submaps:
-        digest = _submap_digest(submap)
-        if held.get(submap.submap_id) != digest:
-            row = (*submap.submap_id, digest, _submap_to_bytes(submap))
-            connection.execute("INSERT OR REPLACE INTO submaps VALUES (?, ?, ?, ?, ?)", row)
+def _state(records: dict[tuple[str, str], bytes], max_bytes: int) -> QueueState:
+    of_kind: dict[str, dict[str, bytes]] = {}
+    for (kind, key), content in sorted(records.items()):
+        of_kind.setdefault(kind, {})[key] = content
+    return _assembled(
+        {name: json.loads(content) for name, content in of_kind.get("meta", {}).items()},
+        list(of_kind.get("submap", {}).values()),
+        [_submap_id(json.loads(key)) for key in of_kind.get("withdrawn", {})],
+        [json.loads(content) for content in of_kind.get("answer", {}).values()],
+        max_bytes,
+    )
 
 
-def _read(connection: sqlite3.Connection) -> QueueState:
-    meta = {name: json.loads(v) for name, v in connection.execute("SELECT name, value FROM meta")}
+def _read_first_version(connection: sqlite3.Connection, max_bytes: int) -> QueueState:
+    rows = connection.execute("SELECT name, value FROM meta").fetchall()
     submaps = connection.execute("SELECT content FROM submaps")
+    withdrawn = connection.execute("SELECT * FROM withdrawn")
     answers = connection.execute("SELECT content FROM answers")
+    return _assembled(
+        {name.decode(): json.loads(value) for name, value in rows},
+        [content for (content,) in submaps],
+        [_submap_id((vehicle.decode(), *numbers)) for vehicle, *numbers in withdrawn],
+        [json.loads(content) for (content,) in answers],
+        max_bytes,
+    )
+
+
+def _assembled(
+    meta: dict[str, Any],
+    submaps: list[bytes],
+    withdrawn: list[SubmapId],
+    answers: list[dict[str, Any]],
+    max_bytes: int,
+) -> QueueState:
     anchor, lattice = meta["anchor"], meta["lattice"]
     return QueueState(
-        tuple(sorted((_submap_from_bytes(content) for (content,) in submaps), key=_by_submap_id)),
-        frozenset(_submap_id(row) for row in connection.execute("SELECT * FROM withdrawn")),
-        tuple(_answer_from_plain(json.loads(content)) for (content,) in answers),
+        tuple(
+            sorted(
+                (_submap_from_bytes(content, max_bytes) for content in submaps),
+                key=lambda submap: submap.submap_id,
+            )
+        ),
+        frozenset(withdrawn),
+        tuple(_answer_from_plain(answer) for answer in answers),
         None if anchor is None else _submap_id(anchor),
         None if lattice is None else _spec_from_plain(lattice),
         tuple(_track(plain) for plain in meta["vehicles"]),
@@ -239,10 +384,6 @@ def _read(connection: sqlite3.Connection) -> QueueState:
         ),
         bool(meta.get("is_pinned", True)),
     )
-
-
-def _by_submap_id(submap: Submap) -> SubmapId:
-    return submap.submap_id
 
 
 def _submap_id(plain: Sequence[Any]) -> SubmapId:
@@ -275,19 +416,17 @@ def _submap_digest(submap: Submap) -> bytes:
 
 
 def _submap_to_bytes(submap: Submap) -> bytes:
-    buffer = io.BytesIO()
     arrays: dict[str, Any] = {n: np.asarray(getattr(submap, n)) for n in _SUBMAP_ARRAYS}
     header = np.frombuffer(_submap_header(submap), dtype=np.uint8)
-    np.savez_compressed(buffer, header=header, values=submap.grid.values, **arrays)
-    return buffer.getvalue()
+    return arrays_to_bytes({"header": header, "values": submap.grid.values, **arrays})
 
 
-def _submap_from_bytes(content: bytes) -> Submap:
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        header = json.loads(arrays["header"].tobytes())
-        grid = OccupancyMap(_spec_from_plain(header.pop("spec")), arrays["values"])
-        T_odom_submap = SE2(*header.pop("T_odom_submap"))
-        rest = {name: arrays[name] for name in _SUBMAP_ARRAYS}
+def _submap_from_bytes(content: bytes, max_bytes: int) -> Submap:
+    arrays = arrays_from_bytes(content, max_bytes)
+    header = json.loads(arrays["header"].tobytes())
+    grid = OccupancyMap(_spec_from_plain(header.pop("spec")), arrays["values"])
+    T_odom_submap = SE2(*header.pop("T_odom_submap"))
+    rest: dict[str, Any] = {name: arrays[name] for name in _SUBMAP_ARRAYS}
     return Submap(T_odom_submap=T_odom_submap, grid=grid, **header, **rest)
 
 
@@ -304,6 +443,10 @@ def _answer_digest(answer: Answer) -> bytes:
     source, target, prior = answer.query.key
     text = repr(prior).encode() + repr(_answer_to_plain(answer)).encode()
     return hashlib.blake2b(source + target + text, digest_size=16).digest()
+
+
+def _answer_to_bytes(answer: Answer) -> bytes:
+    return json.dumps(_answer_to_plain(answer)).encode()
 
 
 def _answer_to_plain(answer: Answer) -> dict[str, Any]:

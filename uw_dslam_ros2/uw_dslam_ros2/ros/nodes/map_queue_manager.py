@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -30,7 +31,7 @@ from uw_dslam_ros2.core.merging import (
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
-from uw_dslam_ros2.io.session import load_session, save_session
+from uw_dslam_ros2.io.session import load_session
 from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_to_msg,
     submap_frame_id,
@@ -49,9 +50,10 @@ from uw_dslam_ros2.ros.plumbing.map_publisher import MapPublisher
 from uw_dslam_ros2.ros.plumbing.node_settings import MapQueueManagerConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import LATCHED, SUBMAPS
-from uw_dslam_ros2.ros.plumbing.queue_services import QueueServices, has_session
+from uw_dslam_ros2.ros.plumbing.queue_services import QueueServices
 from uw_dslam_ros2.ros.plumbing.registration_clients import RegistrationClients
 from uw_dslam_ros2.ros.plumbing.running import run_node
+from uw_dslam_ros2.ros.plumbing.session_keeper import SessionKeeper
 from uw_dslam_ros2.ros.plumbing.throttle import Throttle
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 
@@ -82,14 +84,13 @@ class MapQueueManager(Node):
         self._values: dict[str, float | int | str] = {}
         self._asked: dict[int, MatchRequest] = {}
         self._is_changed = True
-        self._is_saved = True
         # Drawing a large map takes a second: questions and answers come first.
         self._drawing = Throttle(self._config.publish_period_s)
         self._status_s = self._discovered_s = float("-inf")
         self._sent_transforms: tuple[Any, ...] = ()
         self._is_tick_posted = threading.Event()
-        if self._config.session:
-            self._resume(self._config.session)
+        self._keeper = SessionKeeper(self._config.session, self.complain)
+        self._resume()
 
         self._map = MapPublisher(self, self._config.map_frame, self._config.full_map_period_s)
         self._status_pub = self.create_publisher(MergeStatus, "merge_status", LATCHED)
@@ -116,9 +117,7 @@ class MapQueueManager(Node):
     def stop(self) -> None:
         """End the worker after the job at hand; keep the session."""
         self._worker.close(timeout_s=10.0)
-        if not self._is_saved and self._config.session:
-            self._is_saved = True
-            save_session(self._config.session, self._queue)
+        self._keeper.close(self._queue)
 
     def destroy_node(self) -> None:
         """Stop, then destroy."""
@@ -182,7 +181,7 @@ class MapQueueManager(Node):
         """Note that the queue was changed."""
         self._message = message
         self._is_changed = True
-        self._is_saved = False
+        self._keeper.note_change()
 
     def _tick(self) -> None:
         self._is_tick_posted.clear()
@@ -195,9 +194,7 @@ class MapQueueManager(Node):
         self._queue.is_growing = self._idle.is_active(now_s)
         self._ask()
         # First saved, then told: what anybody has heard of outlives a kill.
-        if not self._is_saved and self._config.session:
-            save_session(self._config.session, self._queue)
-            self._is_saved = True
+        self._keeper.save_if_due(self._queue)
         if self._is_changed and self._drawing.is_due():
             self._is_changed = False
             with self._drawing.turn():
@@ -363,18 +360,25 @@ class MapQueueManager(Node):
         self._idle.end()
         self._tick()
 
-    def _resume(self, path: str) -> None:
+    def save_session(self, path: str) -> Path:
+        """Save the queue in a folder, be it the manager's own or another."""
+        return self._keeper.save_in(path, self._queue)
+
+    def _resume(self) -> None:
         """Go on where a session ended; a damaged one ends the start with a clear sentence."""
-        if has_session(path):
-            self._queue = load_session(path, self._queue_config)
-            self._message = f"session {path} resumed"
-        else:
-            self._message = f"a new session begins in {path}"
+        queue = self._keeper.load(self._queue_config)
+        if queue is not None:
+            self._queue = queue
+            self._message = f"session {self._config.session} resumed"
+        elif self._config.session:
+            self._message = f"a new session begins in {self._config.session}"
         self.get_logger().info(self._message)
 
     def _report(self) -> Report:
         values = {**self._values, **dict(sorted(self._counts.items()))}
         values["num_jobs_waiting"] = self._worker.num_waiting
+        if trouble := self._keeper.trouble:
+            return "error", trouble, values
         num_servers = self._values.get("num_servers", 0)
         if not num_servers:
             return "warning", "no registration server on the graph", values

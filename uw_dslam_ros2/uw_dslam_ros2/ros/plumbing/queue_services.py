@@ -25,12 +25,12 @@ from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
-from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, save_session
+from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, has_session
 from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
 from uw_dslam_ros2.ros.convert.merging import record_to_msg
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 
-__all__ = ["QueueOwner", "QueueServices", "has_session"]
+__all__ = ["QueueOwner", "QueueServices"]
 
 _TIMEOUT_S = 600.0
 
@@ -49,6 +49,10 @@ class QueueOwner(Protocol):
 
     def resume(self, path: str) -> MapQueue:
         """Go on with the session in a folder, in the place of the queue."""
+        ...
+
+    def save_session(self, path: str) -> Path:
+        """Save the queue in a folder; the session's file."""
         ...
 
     def settle(self) -> None:
@@ -152,7 +156,7 @@ class QueueServices:
         if not request.path:
             raise InvalidInputError("path is empty, expected a folder")
         queue = self._owner.queue
-        paths = [save_session(request.path, queue), *export_queue(request.path, queue)]
+        paths = [self._owner.save_session(request.path), *export_queue(request.path, queue)]
         response.files = [str(path) for path in paths]
         response.result = response.DONE
         response.message = f"{len(response.files)} files written"
@@ -172,11 +176,6 @@ class QueueServices:
         self._owner.settle()
         response.success = True
         response.message = "what is left to match is asked now"
-
-
-def has_session(path: str) -> bool:
-    """Whether a folder holds a session."""
-    return (Path(path) / SESSION_FILE).is_file()
 
 
 def _not_found(submap_id: SubmapId) -> str:
