@@ -28,6 +28,7 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg
 from uw_dslam_ros2.ros.nodes import registration_server
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
+from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 
 pytestmark = pytest.mark.ros
 
@@ -137,6 +138,27 @@ def test_searches_side_by_side_find_what_each_finds_alone(serve):
         distance_m, angle_rad = T_found.distance_to(expected.T_target_source)
         assert distance_m < 1e-3  # a message's origin has another precision than a map's
         assert angle_rad < 1e-4
+
+
+@pytest.mark.parametrize("max_waiting", [2, 40])
+def test_every_request_of_a_burst_is_answered(serve, gate, max_waiting):
+    """More at once than DDS keeps by default: each is searched, or told to come again."""
+    with serve(max_parallel=1, max_waiting=max_waiting) as (until, probe):
+        client = probe.create_client(
+            RegisterMaps, "/registration_server/register_maps", qos_profile=SERVICES
+        )
+        until(client.service_is_ready, "the service")
+        request = RegisterMaps.Request(source=map_msg(), target=map_msg())
+        futures = [client.call_async(request) for _ in range(40)]
+        until(lambda: gate.num_running, "the first search")
+        gate.opened.set()
+        until(lambda: all(future.done() for future in futures), "all answers")
+    results = [future.result().result for future in futures]
+    assert results.count(Response.DONE) >= 1
+    if max_waiting >= len(futures):
+        assert results == [Response.DONE] * len(futures)
+    else:
+        assert set(results) <= {Response.DONE, Response.BUSY}
 
 
 def test_point_sets_are_aligned(serve, rng):

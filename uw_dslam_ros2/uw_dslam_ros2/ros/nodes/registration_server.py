@@ -38,6 +38,7 @@ from uw_dslam_ros2.ros.convert.registration import options_from_msg, registratio
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.node_settings import RegistrationServerConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 from uw_dslam_ros2.ros.plumbing.registration_jobs import Job, RegistrationJobs, Search
 from uw_dslam_ros2.ros.plumbing.running import run_node
 
@@ -63,15 +64,13 @@ class RegistrationServer(Node):
         self.num_threads = self._jobs.max_accepted + 4
         self._statistics = _Statistics()
         group = ReentrantCallbackGroup()
-        self.create_service(
-            RegisterMaps, "~/register_maps", self._on_register_maps, callback_group=group
-        )
-        self.create_service(
-            RegisterPointSets,
-            "~/register_point_sets",
-            self._on_register_point_sets,
-            callback_group=group,
-        )
+        for service_type, name, serve in (
+            (RegisterMaps, "~/register_maps", self._on_register_maps),
+            (RegisterPointSets, "~/register_point_sets", self._on_register_point_sets),
+        ):
+            self.create_service(
+                service_type, name, serve, qos_profile=SERVICES, callback_group=group
+            )
         self._action = ActionServer(
             self,
             RegisterMapsAction,
@@ -79,6 +78,9 @@ class RegistrationServer(Node):
             self._execute,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             callback_group=group,
+            goal_service_qos_profile=SERVICES,
+            result_service_qos_profile=SERVICES,
+            cancel_service_qos_profile=SERVICES,
         )
         # New with every start: whoever waits for an answer sees that its server is gone.
         instance = f"{socket.gethostname()}:{os.getpid()}:{time.time_ns()}"

@@ -2,7 +2,17 @@
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-__all__ = ["CLOCK", "DEFAULT", "LATCHED", "PLAYBACK", "STATIC_TF", "SUBMAPS", "TF", "sensor_qos"]
+__all__ = [
+    "CLOCK",
+    "DEFAULT",
+    "LATCHED",
+    "PLAYBACK",
+    "SERVICES",
+    "STATIC_TF",
+    "SUBMAPS",
+    "TF",
+    "sensor_qos",
+]
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -20,6 +30,9 @@ STATIC_TF = QoSProfile(
 TF = QoSProfile(depth=100)
 DEFAULT = QoSProfile(depth=10)
 CLOCK = QoSProfile(depth=10)
+
+SERVICES = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+"""Requests and answers: of the usual ten, a burst loses those that come while none is taken."""
 
 PLAYBACK = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 """What a bag player offers: reliable, so that large images arrive; best effort matches it too."""

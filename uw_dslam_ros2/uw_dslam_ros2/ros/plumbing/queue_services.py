@@ -28,6 +28,7 @@ from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, has_session
 from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
 from uw_dslam_ros2.ros.convert.merging import record_to_msg
+from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["QueueOwner", "QueueServices"]
@@ -82,7 +83,9 @@ class QueueServices:
             (Trigger, "settle", self._settle),
         ):
             serve = functools.partial(self._serve, handler)
-            node.create_service(service_type, f"~/{name}", serve, callback_group=group)
+            node.create_service(
+                service_type, f"~/{name}", serve, qos_profile=SERVICES, callback_group=group
+            )
 
     def _serve(self, handler: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
         try:

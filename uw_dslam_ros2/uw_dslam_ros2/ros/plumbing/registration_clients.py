@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from uw_dslam_msgs.srv import RegisterMaps
 
-from uw_dslam_ros2.ros.plumbing.qos import DEFAULT
+from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, SERVICES
 
 __all__ = ["RegistrationClients"]
 
@@ -77,7 +77,9 @@ class RegistrationClients:
         )
 
     def _add(self, service_name: str) -> None:
-        client = self._node.create_client(RegisterMaps, service_name, callback_group=self._group)
+        client = self._node.create_client(
+            RegisterMaps, service_name, qos_profile=SERVICES, callback_group=self._group
+        )
         self._servers[service_name] = _Server(service_name, client)
 
     def discover(self) -> None:
