@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.cli.studies import field, sigma, verdict
+from uw_dslam_ros2.cli.studies import _verdict_trials, field, sigma
 from uw_dslam_ros2.cli.studies._ceiling import best_with_known_noise
 from uw_dslam_ros2.cli.studies._common import is_success
 from uw_dslam_ros2.cli.studies._trials import Cell
@@ -126,9 +126,10 @@ def _rows(path):
 
 
 def test_verdict_prints_models_that_can_be_pasted(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(verdict, "_SIZES", (120,))
+    monkeypatch.setattr(_verdict_trials, "SIZES", (120,))
     kinds = ["--fit-kinds", "harbour", "--check-kinds", "harbour", "--overlaps", "0.7"]
-    assert main(["verdict", "--out", str(tmp_path), "--seeds", "1", "--checks", "1", *kinds]) == 0
+    few = ["--seeds", "1", "--checks", "1", "--places", "1", "--check-places", "0"]
+    assert main(["verdict", "--out", str(tmp_path), *few, *kinds]) == 0
     printed = capsys.readouterr().out
     assert "pose=(" in printed
     assert "match=(" in printed

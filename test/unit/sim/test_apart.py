@@ -95,7 +95,7 @@ def test_a_bend_widens_the_tolerance():
     assert plain is not None
     assert wide is not None
     assert plain == pytest.approx(0.3 + 2 * 0.5)
-    assert 0.4 < wide - plain < 1.0
+    assert 0.2 < wide - plain < 0.5
 
 
 def test_maps_that_share_nothing_have_no_answer():

@@ -46,7 +46,7 @@ _NUM_AREA_TRIES = 30
 _LEAST_AREA_M = 30.0
 _LOCAL_M = 25.0  # poses this near the middle of what both saw say where it lies
 _LEAST_LOCAL = 12
-_TOLERANCE_M, _TOLERANCE_CELLS, _TOLERANCE_BENDS = 0.3, 2.0, 2.0
+_TOLERANCE_M, _TOLERANCE_CELLS, _TOLERANCE_BENDS = 0.3, 2.0, 1.0
 _TOLERANCE_RAD = math.radians(3.0)
 
 

@@ -1,83 +1,58 @@
 """Fit the probability of a map match on some places, and judge it on others.
 
-Evidence of simulated pairs is gathered without the proof: of one place, of different places, of
-symmetric ones, of the two like ends of one basin; half of the pairs once more with a prior window
-of random size. Two small logistic models are fitted: whether a pose is right, from what speaks for
-it by itself, on all refined poses; and whether the best pose is right, in view of its strongest
-rival. The first model also says which pose is the best, so after it has changed much the evidence
-has to be gathered once more for the second to be that of its choices. The models are
-judged on other seeds and on kinds of places that the fit never saw. The coefficients that this
-command prints are those of `uw_dslam_ros2.core.registration.grids.probability.MODELS`.
+Evidence of simulated pairs is gathered without the proof: windows of one map, of different places,
+of symmetric ones, of the two like ends of one basin, and maps that were built apart, as in `study
+apart`; half of the pairs once more with a prior window of random size. Two small logistic models
+are fitted: whether a pose is right, from what speaks for it by itself, on all refined poses; and
+whether the best pose is right, in view of its strongest rival. The first model also says which
+pose is the best, so after it has changed much the evidence has to be gathered once more for the
+second to be that of its choices. The models are judged on other seeds and on kinds of places that
+the fit never saw. The coefficients that this command prints are those of
+`uw_dslam_ros2.core.registration.grids.probability.MODELS`.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+import itertools
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
+from uw_dslam_ros2.cli.studies._apart_maps import apart_maps
 from uw_dslam_ros2.cli.studies._common import (
     figure,
     print_table,
-    progress,
     save_figure,
     share_interval,
 )
-from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, random_prior
+from uw_dslam_ros2.cli.studies._verdict_trials import Trial, apart_tasks, gathered, window_tasks
 from uw_dslam_ros2.core.registration.grids.probability import (
     MATCH_FEATURES,
     POSE_FEATURES,
-    MatchEvidence,
-    PoseEvidence,
     VerdictModels,
     match_features,
     pose_features,
     probability_of,
     rival_probability,
 )
-from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, match_evidence
+from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.verdict import decide
 from uw_dslam_ros2.core.registration.result import Verdict
-from uw_dslam_ros2.sim.map_pairs import is_right
 
 FloatArray = NDArray[np.float64]
 
 _FIT_KINDS = ("corridors", "office", "hall", "harbour", "lake", "basin", "symmetric")
 _CHECK_KINDS = ("oblique", "cellular", "cave", "corridors", "harbour", "symmetric")
-_WATERS = ("harbour", "lake", "cave")
 _OVERLAPS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
-_NOISES = ("clean", "noisy", "hard")
-_SIZES = (260, 260, 260, 160, 400)
 _FIRST_CHECK = 1000
 _RIDGE = 1.0
-# How rare a basin is whose other end looks the same, against the other places: nothing in the maps
-# of its ends can tell them apart where piers and corners are the same.
-_BASIN_WEIGHT = 0.3
 _OTHER_WEIGHT = 0.3  # of poses beside that of the highest score: there are several in each pair
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    spec: PairSpec
-    has_prior: bool
-    evidence: MatchEvidence
-    poses: tuple[tuple[PoseEvidence, bool], ...]  # the best one first, and whether it is right
-
-    @property
-    def is_right(self) -> bool:
-        """Whether the best pose is."""
-        return self.poses[0][1]
-
-    @property
-    def weight(self) -> float:
-        """In a fit."""
-        return _BASIN_WEIGHT if self.spec.kind == "basin" else 1.0
+_APART_BINS = (0.05, 0.2, 0.4, 0.5, 1.01)
+_NUM_VEHICLES = 4  # maps of each place
+_DIFFERENT_OF_PLACE = 10  # pairs of different places, for each place that was mapped apart
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,19 +64,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--check-kinds", nargs="+", default=list(_CHECK_KINDS), help="places judged on"
     )
     parser.add_argument("--overlaps", nargs="+", type=float, default=list(_OVERLAPS))
+    parser.add_argument(
+        "--places", type=int, default=80, help="places mapped apart, of the fit (%(default)s)"
+    )
+    parser.add_argument(
+        "--check-places", type=int, default=40, help="places mapped apart, held out (%(default)s)"
+    )
+    parser.add_argument(
+        "--cache", type=Path, metavar="DIR", help="folder of maps built apart (default: in --out)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Gather, fit, check, draw."""
-    fit = _gathered(
-        args.out / "fit.csv",
-        _specs(args.fit_kinds, args.overlaps, range(args.seeds)),
-    )
+    fit = _gathered(args, "fit", args.fit_kinds, range(args.seeds), args.places)
     models = _fitted(fit)
-    check = _gathered(
-        args.out / "check.csv",
-        _specs(args.check_kinds, args.overlaps, range(_FIRST_CHECK, _FIRST_CHECK + args.checks)),
-    )
+    seeds = range(_FIRST_CHECK, _FIRST_CHECK + args.checks)
+    check = _gathered(args, "check", args.check_kinds, seeds, args.check_places)
     _print_models(models)
     for name, trials in (("fitted", fit), ("held out", check)):
         print(f"\n{name}: {len(trials)} answers")
@@ -113,49 +92,18 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _specs(kinds: Iterable[str], overlaps: Iterable[float], seeds: range) -> Iterator[PairSpec]:
-    """Pairs of all kinds, overlaps and noises; some again of two places, or of aliases."""
-    for seed in seeds:
-        for kind in kinds:
-            rng = np.random.default_rng((seed, sum(kind.encode())))
-            for overlap in overlaps:
-                for noise in _NOISES:
-                    is_sonar = kind in _WATERS and rng.random() < 0.35
-                    size = int(rng.choice(_SIZES))
-                    other = rng.random() < 0.6
-                    yield PairSpec(kind, overlap, noise, seed, True, is_sonar, False, size)
-                    if other:
-                        is_alias = kind == "basin"
-                        yield PairSpec(kind, overlap, noise, seed, False, is_sonar, is_alias, size)
+def _gathered(
+    args: argparse.Namespace, name: str, kinds: list[str], seeds: range, num_places: int
+) -> list[Trial]:
+    """Evidence of windows, and of maps that were built apart."""
+    trials = gathered(args.out / f"{name}.csv", window_tasks(kinds, args.overlaps, seeds))
+    places = range(seeds.start, seeds.start + num_places)
+    maps = apart_maps(places, _NUM_VEHICLES, args.cache or args.out / "maps")
+    tasks = apart_tasks(maps, _DIFFERENT_OF_PLACE * num_places, seeds.start)
+    return trials + gathered(args.out / f"{name}_apart.csv", tasks, is_apart=True)
 
 
-def _gathered(path: Path, specs: Iterable[PairSpec]) -> list[_Trial]:
-    """Evidence of all pairs; what the models see of it is kept in a CSV file."""
-    trials: list[_Trial] = []
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        names = (*PairSpec.__annotations__, "has_prior", "is_right", *POSE_FEATURES, "rival_share")
-        writer.writerow(names)
-        for number, spec in enumerate(progress(list(specs), text=path.stem)):
-            pair = spec.make()
-            rng = np.random.default_rng((number, spec.seed))
-            for has_prior in (False, True)[: 1 + int(rng.random() < 0.5)]:
-                prior = random_prior(pair, rng) if has_prior else None
-                found = match_evidence(pair.source, pair.target, prior=prior)
-                if found is None:
-                    continue
-                evidence, weighed = found
-                poses = tuple((pose, is_right(pair, motion)) for pose, motion in weighed)
-                trials.append(_Trial(spec, has_prior, evidence, poses))
-                features = pose_features(evidence.best, evidence.log_volume)
-                writer.writerow(
-                    (*asdict(spec).values(), has_prior, trials[-1].is_right, *features,
-                     evidence.rival_share)
-                )  # fmt: skip
-    return trials
-
-
-def _fitted(trials: list[_Trial]) -> VerdictModels:
+def _fitted(trials: list[Trial]) -> VerdictModels:
     """Both models, one after the other.
 
     A pose in a symmetric place is convincing for itself wherever it is: there, rivals decide. The
@@ -208,30 +156,35 @@ def _print_models(models: VerdictModels) -> None:
         print(f"{name}={model}")
 
 
-def _groups(trials: list[_Trial]) -> dict[str, list[_Trial]]:
+def _groups(trials: list[Trial]) -> dict[str, list[Trial]]:
     """Trials by what is asked of them; those with a prior by themselves."""
 
-    def group(trial: _Trial) -> str:
+    def group(trial: Trial) -> str:
         spec = trial.spec
         if spec.is_alias:
             return "like ends of one basin"
         if not spec.is_matching:
-            return "different places"
+            if spec.kind == "twin":
+                return "twins"
+            return "different places, apart" if trial.is_apart else "different places"
         if spec.kind in ("symmetric", "basin"):
             return "symmetric place"
         if trial.has_prior:
             return "prior window"
+        if trial.is_apart:
+            low, high = next(b for b in itertools.pairwise(_APART_BINS) if spec.overlap < b[1])
+            return f"apart, {low:.0%} to {high:.0%}".replace("%", " %")
         if spec.overlap >= 0.5:
             return "overlap 50 % and more"
         return f"overlap {spec.overlap:.0%}".replace("%", " %")
 
-    groups: dict[str, list[_Trial]] = {}
+    groups: dict[str, list[Trial]] = {}
     for trial in trials:
         groups.setdefault(group(trial), []).append(trial)
     return dict(sorted(groups.items()))
 
 
-def _print_thresholds(trials: list[_Trial], models: VerdictModels) -> None:
+def _print_thresholds(trials: list[Trial], models: VerdictModels) -> None:
     probability = np.array([probability_of(t.evidence, models) for t in trials])
     right = np.array([t.is_right for t in trials])
     groups = _groups(trials)
@@ -255,7 +208,7 @@ def _print_thresholds(trials: list[_Trial], models: VerdictModels) -> None:
     print_table(("threshold", "right, 50 % and more", "right, 30 %", "wrong", "of no match"), rows)
 
 
-def _print_verdicts(trials: list[_Trial], models: VerdictModels) -> None:
+def _print_verdicts(trials: list[Trial], models: VerdictModels) -> None:
     config = GridRegistrationConfig()
     rows = []
     for name, members in _groups(trials).items():
@@ -280,7 +233,7 @@ def _print_verdicts(trials: list[_Trial], models: VerdictModels) -> None:
     )
 
 
-def _draw(path: Path, sets: dict[str, list[_Trial]], models: VerdictModels) -> None:
+def _draw(path: Path, sets: dict[str, list[Trial]], models: VerdictModels) -> None:
     """Reliability diagram: share of right matches over the stated probability."""
     picture, (row,) = figure()
     axes = row[0]
