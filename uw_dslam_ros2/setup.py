@@ -32,7 +32,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            *(f"{node} = {NAME}.ros.nodes.{node}:main" for node in NODES),
+            *(f"{node} = {NAME}.ros.start:{node}" for node in NODES),
             *(f"{command} = {NAME}.cli.{command}:main" for command in COMMANDS),
         ],
     },

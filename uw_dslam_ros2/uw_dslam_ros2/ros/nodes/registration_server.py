@@ -85,6 +85,7 @@ class RegistrationServer(Node):
         # New with every start: whoever waits for an answer sees that its server is gone.
         instance = f"{socket.gethostname()}:{os.getpid()}:{time.time_ns()}"
         self._diagnostics = Diagnostics(self, self._report, instance)
+        self.get_logger().info(f"serving, {self._jobs.max_parallel} searches at a time")
 
     def stop(self) -> None:
         """Stop the searches, so that whoever waits for them gets an answer."""

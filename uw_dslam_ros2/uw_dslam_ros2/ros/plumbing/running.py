@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,6 +21,8 @@ from uw_dslam_ros2.core.errors import UwDslamError
 __all__ = ["run_node"]
 
 _LOOK_UP_S = 0.2
+_END_WITHIN_S = 1.7
+"""Launch files and service managers kill after a few seconds; by then we are gone."""
 
 
 def _let_callbacks_end(executor: MultiThreadedExecutor) -> None:
@@ -29,12 +33,23 @@ def _let_callbacks_end(executor: MultiThreadedExecutor) -> None:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+def _end_in_time(name: str, is_stopped: threading.Event) -> None:
+    """End the process, some time after it was told to, whatever it still waits for.
+
+    What anybody was told of is saved by then: a hard end loses what a kill would.
+    """
+    is_stopped.wait()
+    time.sleep(_END_WITHIN_S)
+    get_logger(name).warning(f"ended in the middle of a job that took over {_END_WITHIN_S} s")
+    os._exit(0)
+
+
 def run_node(name: str, make_node: Callable[[], Node], argv: Sequence[str] | None) -> int:
     """Spin a node until SIGINT or SIGTERM; return the process's exit code.
 
     A node whose callbacks wait says in `num_threads` how many threads it needs, and has a method
-    `stop` that ends their waiting. A wrong setting or file ends the process with one sentence and
-    code 1, not with a traceback.
+    `stop` that ends their waiting; it has under two seconds for that. A wrong setting or file
+    ends the process with one sentence and code 1, not with a traceback.
     """
     # rclpy's own handlers would pull the context away under callbacks that still want to answer.
     rclpy.init(
@@ -45,6 +60,7 @@ def run_node(name: str, make_node: Callable[[], Node], argv: Sequence[str] | Non
     def stop(*_: Any) -> None:
         is_stopped.set()  # a second signal changes nothing: it must not tear the node half-way
 
+    threading.Thread(target=_end_in_time, args=(name, is_stopped), daemon=True).start()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
     node: Node | None = None
