@@ -22,6 +22,7 @@ CLOSED = {
     "ros.plumbing": {"ros.nodes"},
     "core.mapping": {"core.merging"},
     "core.merging": {"core.mapping"},
+    "core.link": {"core.mapping", "core.merging"},
     "core.registration": {"core.mapping", "core.merging"},
     "core.registration.search": {
         f"core.registration.{room}" for room in ("points", "grids", "baselines")

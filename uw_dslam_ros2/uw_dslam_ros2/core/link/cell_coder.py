@@ -1,0 +1,226 @@
+"""Cells of three values to few bytes and back: a binary range coder with mixed context models.
+
+Whole numbers only, so that sender and receiver need not be of one make: every probability comes
+out alike on every processor. The coder is one loop for both ways, which cannot disagree with
+itself. (`constriction`, the library that comes to mind, takes its probabilities as floats and one
+call from Python for each adaptive symbol, and is not in Ubuntu's packages.)
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+
+__all__ = ["CELL_FREE", "CELL_UNKNOWN", "CELL_WALL", "decode_cells", "encode_cells"]
+
+CellArray = NDArray[np.int8]
+
+CELL_UNKNOWN, CELL_FREE, CELL_WALL = 0, 1, 2
+"""Values of cells."""
+
+_STRETCH_LIMIT = 3071  # of log-odds in units of 1/256 nat
+# Number of contexts of each model, and of all those before it; see `_contexts`.
+_SIZES = tuple(3**n for n in (3, 5, 7, 10, 7, 8, 6, 7, 9))
+_STARTS = tuple(sum(_SIZES[:k]) for k in range(len(_SIZES) + 1))
+_NUM_MODELS = len(_SIZES)
+_NUM_SURE = 6  # a model's weight depends on how often it has seen the context
+_MAX_COUNT = 60
+_FIRST_WEIGHT = 3 * 65536 // 10
+_LEARNING_SHIFT = 14
+
+
+@functools.cache
+def _tables() -> tuple[NDArray[np.int64], ...]:
+    """What the coder looks up.
+
+    Where each model's contexts begin, log-odds of 12-bit probabilities, 16-bit probabilities of
+    log-odds, and how far the first, second, ... sight of a context moves its probability.
+
+    No entry lies so near to a half that the rounding could depend on a mathematical library; a
+    test sees to it.
+    """
+    probability = (np.arange(4096) + 0.5) / 4096.0
+    stretch = np.rint(256.0 * np.log(probability / (1.0 - probability))).astype(np.int64)
+    odds = np.arange(-_STRETCH_LIMIT, _STRETCH_LIMIT + 1) / 256.0
+    squash = np.rint(65536.0 / (1.0 + np.exp(-odds))).astype(np.int64)
+    rate = 2 * 65536 // (2 * np.arange(_MAX_COUNT + 1) + 3)
+    return np.array(_STARTS), stretch, np.clip(squash, 1, 65535), rate
+
+
+def encode_cells(cells: CellArray, coarse: CellArray) -> bytes:
+    """Encode cells (R, C); `coarse` (R, C) is what the receiver has of each of them already."""
+    buffer = np.zeros(4 * cells.size + 16, np.uint8)  # no bit costs more than 16
+    _check(cells, coarse)
+    num_bytes = _code(
+        np.array(cells, np.int8), np.ascontiguousarray(coarse), buffer, False, *_tables()
+    )
+    return bytes(buffer[:num_bytes]).rstrip(b"\0")
+
+
+def decode_cells(data: bytes, coarse: CellArray) -> CellArray:
+    """Decode what `encode_cells` made with the same `coarse`; of other bytes come other cells."""
+    cells = np.zeros(coarse.shape, np.int8)
+    _check(cells, coarse)
+    _code(
+        cells,
+        np.ascontiguousarray(coarse),
+        np.frombuffer(bytearray(data), np.uint8),
+        True,
+        *_tables(),
+    )
+    return cells
+
+
+def _check(cells: CellArray, coarse: CellArray) -> None:
+    if cells.shape != coarse.shape or cells.ndim != 2:
+        raise InvalidInputError(
+            f"cells have shape {cells.shape}, what is known of them {coarse.shape}; expected the "
+            "same two sides"
+        )
+
+
+@njit(cache=True, nogil=True)
+def _at(cells, row, col):  # type: ignore[no-untyped-def]
+    """A cell; outside nothing is known."""
+    if row < 0 or col < 0 or row >= cells.shape[0] or col >= cells.shape[1]:
+        return 0
+    return int(cells[row, col])
+
+
+@njit(cache=True, nogil=True)
+def _contexts(cells, coarse, row, col, found):  # type: ignore[no-untyped-def]
+    """Number the neighbourhoods of a cell, of cells that came before it and of coarse ones.
+
+    Where all neighbours are alike, as most are, returns the number of that case and no more; else
+    -1.
+    """
+    w, n = _at(cells, row, col - 1), _at(cells, row - 1, col)
+    nw, ne = _at(cells, row - 1, col - 1), _at(cells, row - 1, col + 1)
+    ww, nn = _at(cells, row, col - 2), _at(cells, row - 2, col)
+    nww, nee = _at(cells, row - 1, col - 2), _at(cells, row - 1, col + 2)
+    here = _at(coarse, row, col)
+    east, south = _at(coarse, row, col + 1), _at(coarse, row + 1, col)
+    west, north = _at(coarse, row, col - 1), _at(coarse, row - 1, col)
+    south_east, south_west = _at(coarse, row + 1, col + 1), _at(coarse, row + 1, col - 1)
+    if w == n == nw == ne == ww == nn == nww == nee and (
+        here == east == south == west == north == south_east == south_west
+    ):
+        return 3 * w + here
+    www, nnn = _at(cells, row, col - 3), _at(cells, row - 3, col)
+    nnw, nne = _at(cells, row - 2, col - 1), _at(cells, row - 2, col + 1)
+    neee = _at(cells, row - 1, col + 3)
+    east_2, south_2 = _at(coarse, row, col + 2), _at(coarse, row + 2, col)
+    near = ((w * 3 + n) * 3 + nw) * 3 + ne
+    wide = (near * 3 + ww) * 3 + nn
+    found[0] = (w * 3 + n) * 3 + here
+    found[1] = near * 3 + here
+    found[2] = wide * 3 + here
+    found[3] = (((wide * 3 + nee) * 3 + nww) * 3 + nne) * 3 + nnw
+    found[4] = (((((ww * 3 + w) * 3 + www) * 3 + n) * 3 + nw) * 3 + nww) * 3 + here
+    found[5] = ((((((nn * 3 + n) * 3 + nnn) * 3 + w) * 3 + nee) * 3 + ne) * 3 + neee) * 3 + here
+    found[6] = ((((here * 3 + east) * 3 + south) * 3 + west) * 3 + north) * 3 + w
+    found[7] = (((((here * 3 + east) * 3 + south) * 3 + south_east) * 3 + w) * 3 + n) * 3 + ne
+    found[8] = (
+        ((((((here * 3 + south_west) * 3 + south) * 3 + east) * 3 + w) * 3 + n) * 3 + nw) * 3
+        + east_2
+    ) * 3 + south_2
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _learn(probabilities, counts, place, bit, rate):  # type: ignore[no-untyped-def]
+    """Move a probability of a set bit towards what came; the less often, the farther."""
+    count = int(counts[place])
+    old = int(probabilities[place])
+    probabilities[place] = old + (((bit * 65535 - old) * rate[count]) >> 16)
+    counts[place] = min(count + 1, rate.shape[0] - 1)
+
+
+@njit(cache=True, nogil=True)
+def _code(  # type: ignore[no-untyped-def]
+    cells, coarse, buffer, is_decoding, starts, stretch, squash, rate
+):  # fmt: skip
+    """Encode cells (R, C) into the buffer, or decode them from it; returns the bytes used."""
+    limit = squash.shape[0] // 2
+    models = starts.shape[0] - 1
+    size = starts[models]
+    # For each of the two bits of a cell: known or not, then a wall or not.
+    probabilities = np.full(2 * size, 32768, np.int32)
+    counts = np.zeros(2 * size, np.uint8)
+    plain = np.full(18, 32768, np.int32)
+    plain_counts = np.zeros(18, np.uint8)
+    weights = np.full((2, models, _NUM_SURE), _FIRST_WEIGHT, np.int64)
+    context = np.zeros(models, np.int64)
+    inputs = np.zeros(models, np.int64)
+    sure = np.zeros(models, np.int64)
+    low, high, code, place = 0, 0xFFFFFFFF, 0, 0
+    if is_decoding:
+        for _ in range(4):
+            code = (code << 8) | (buffer[place] if place < buffer.shape[0] else 0)
+            place += 1
+    for row in range(cells.shape[0]):
+        for col in range(cells.shape[1]):
+            alike = _contexts(cells, coarse, row, col, context)
+            value = int(cells[row, col])
+            decoded = 0
+            for step in range(2):
+                if alike >= 0:
+                    chance = max(1, int(plain[step * 9 + alike]))
+                else:
+                    mixed = 0
+                    for k in range(models):
+                        at = step * size + starts[k] + context[k]
+                        inputs[k] = stretch[probabilities[at] >> 4]
+                        count = int(counts[at])
+                        sure[k] = count if count < 4 else (4 if count < 12 else 5)
+                        mixed += weights[step, k, sure[k]] * inputs[k]
+                    chance = squash[max(-limit, min(limit, mixed >> 16)) + limit]
+                span = high - low
+                middle = low + ((span >> 16) * chance + (((span & 0xFFFF) * chance) >> 16))
+                if is_decoding:
+                    bit = 1 if code <= middle else 0
+                else:
+                    bit = (1 if value > 0 else 0) if step == 0 else value - 1
+                if bit == 1:
+                    high = middle
+                else:
+                    low = middle + 1
+                while ((low ^ high) & 0xFF000000) == 0:
+                    if is_decoding:
+                        code = ((code & 0xFFFFFF) << 8) | (
+                            buffer[place] if place < buffer.shape[0] else 0
+                        )
+                    else:
+                        buffer[place] = high >> 24
+                    place += 1
+                    low = (low & 0xFFFFFF) << 8
+                    high = ((high & 0xFFFFFF) << 8) | 255
+                if alike >= 0:
+                    _learn(plain, plain_counts, step * 9 + alike, bit, rate)
+                else:
+                    error = (bit << 16) - chance
+                    for k in range(models):
+                        weights[step, k, sure[k]] += (inputs[k] * error) >> _LEARNING_SHIFT
+                        at = step * size + starts[k] + context[k]
+                        _learn(probabilities, counts, at, bit, rate)
+                decoded += bit
+                if bit == 0:
+                    break
+            if is_decoding:
+                cells[row, col] = decoded
+    if is_decoding:
+        return place
+    # As few bytes as name a number between the two, zeros after them.
+    for num_bytes in range(5):
+        mask = 0xFFFFFFFF >> (8 * num_bytes)
+        if (high & ~mask) >= low or num_bytes == 4:
+            for index in range(num_bytes):
+                buffer[place] = (high >> (24 - 8 * index)) & 255
+                place += 1
+            break
+    return place
