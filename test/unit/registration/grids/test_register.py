@@ -160,7 +160,6 @@ def test_the_papers_points_stay_selectable(harbour):
         ("min_overlap", 0.3),
         ("is_proof_required", True),
         ("max_rival_probability", 0.5),
-        ("max_slide_share", 0.5),
         ("free_penalty", 0.1),
     ],
 )

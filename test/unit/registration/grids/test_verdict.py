@@ -21,7 +21,7 @@ from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.registration.rules import at_least, at_most, first_that_applies
 
 AGREEMENT = Agreement(0.5, 800, 0.95, 0.01, 0.5, 0.8, 0.08, 200.0)
-GOOD = MatchEvidence(PoseEvidence(AGREEMENT, 1.0, 12.0), (), 0.4, 16.0)
+GOOD = MatchEvidence(PoseEvidence(AGREEMENT, 1.0, 12.0), (), 0.05, 4.0, 16.0)
 PROVEN = Proof(num_boxes=7, score=0.5, lower_bound=0.5, upper_bound=0.52)
 
 
@@ -41,14 +41,15 @@ def random_pose(rng):
 
 def random_case(rng):
     rivals = tuple(random_pose(rng) for _ in range(rng.integers(0, 4)))
-    evidence = MatchEvidence(random_pose(rng), rivals, math.sqrt(rng.random()), rng.uniform(5, 18))
+    evidence = MatchEvidence(
+        random_pose(rng), rivals, rng.exponential(0.2), rng.uniform(1, 9), rng.uniform(5, 18)
+    )
     config = GridRegistrationConfig(is_proof_required=bool(rng.random() < 0.3))
     if rng.random() < 0.5:
         config = replace(
             config,
             min_probability=rng.random(), max_conflict=rng.random(),
             min_overlap=0.4 * rng.random(), max_rival_probability=rng.random(),
-            max_slide_share=rng.uniform(0.5, 1.0),
         )  # fmt: skip
     proof = Proof(
         is_complete=bool(rng.random() < 0.8), is_optimum=bool(rng.random() < 0.8),
@@ -62,8 +63,8 @@ def random_case(rng):
 SENTENCES = {
     "the walls leave one direction free": (
         Verdict.AMBIGUOUS,
-        lambda e, _: e.slide_share,
-        lambda c, _: c.max_slide_share,
+        lambda e, _: e.deviation_m,
+        None,  # a share of the walls' extent
         "most",
     ),
     "share of the smaller map's": (
@@ -129,7 +130,8 @@ def test_each_sentence_states_the_numbers_that_decided(rng):
         assert verdict is expected
         assert said_side == side
         assert value > said_limit if side == "most" else value < said_limit
-        assert said_limit == pytest.approx(limit(config, probability), abs=0.0051)
+        if limit is not None:
+            assert said_limit == pytest.approx(limit(config, probability), abs=0.0051)
         if measured is not None:
             assert value == pytest.approx(measured(evidence, probability), abs=0.0051)
     assert set(SENTENCES) <= set(seen)
@@ -153,7 +155,7 @@ def test_what_is_accepted_breaks_no_limit_and_the_name_fits_the_cause(rng):
         num_accepted += 1
         assert agreement.overlap >= config.min_overlap
         assert agreement.conflict <= config.max_conflict
-        assert evidence.slide_share <= config.max_slide_share
+        assert evidence.deviation_m <= 0.15 * evidence.extent_m
         assert probability >= config.min_probability
         assert not proof.is_cancelled
         assert not config.is_proof_required or (proof.is_complete and proof.is_optimum)
@@ -166,7 +168,7 @@ def test_every_line_of_the_table_can_decide(rng):
     for _ in range(6000):
         evidence, config, proof = random_case(rng)
         if rng.random() < 0.01:
-            evidence = replace(evidence, slide_share=math.nan)
+            evidence = replace(evidence, deviation_m=math.nan)
         case = _Case(evidence, config, MODELS, proof)
         deciding.add(_RULES.index(first_that_applies(_RULES, case)))
     assert deciding == set(range(len(_RULES)))
@@ -189,7 +191,7 @@ def test_no_number_of_a_pose_that_is_not_finite_is_passed(name, is_rival, bad):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", ["slide_share", "log_volume"])
+@pytest.mark.parametrize("name", ["deviation_m", "extent_m", "log_volume"])
 def test_no_number_of_a_match_that_is_not_finite_is_passed(name, bad):
     refused(replace(GOOD, **{name: bad}), PROVEN, bad)
 

@@ -55,7 +55,7 @@ class WallMap:
         known = cells.known > 0.5
         self.num_known = int(np.count_nonzero(known))
         # 0 unknown, 1 known, 2 known and near a wall
-        self.seen = known * (1 + (self.distance <= _NEAR_CELLS)).astype(np.uint8)
+        self.seen = np.where(known, 1 + (self.distance <= _NEAR_CELLS), 0).astype(np.uint8)
         rows, cols = np.nonzero(is_wall)
         self.points = np.column_stack([cells.col[rows, cols], cells.row[rows, cols]]).astype(
             np.float64

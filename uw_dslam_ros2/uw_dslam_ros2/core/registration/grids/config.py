@@ -53,9 +53,6 @@ class GridRegistrationConfig(Config):
     max_rival_probability: float = setting(
         0.8, 0.0, 1.0, "a rival that by itself is more probable than that makes it ambiguous"
     )
-    max_slide_share: float = setting(
-        0.85, 0.1, 1.0, "score ten cells off in the weakest direction; a straight wall keeps it"
-    )
     min_probability: float = setting(
         0.75, 0.0, 1.0, "least probability of an accepted match", is_basic=True
     )

@@ -9,14 +9,18 @@ each other (the sandwich estimator of a maximum with clustered observations: Hub
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem
 
-__all__ = ["curvature", "pose_covariance", "slide_share"]
+__all__ = ["PoseSpread", "curvature", "pose_spread"]
 
 FloatArray = NDArray[np.float64]
+Seen = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 _BLOCK_CELLS = 32.0
 _STRAIN_CELLS = 24.0
 _LEAST_POINTS = 8  # of a square whose own displacement is looked at
@@ -25,7 +29,24 @@ _LEAST_POINTS = 8  # of a square whose own displacement is looked at
 # maps that were not simulated.
 _UNSEEN_PER_CELL2 = 60.0
 _FLOOR_CELLS = 0.03
-_FREE_SLIDE_SHARE = 0.85  # as good as free: the pose may be anywhere along the map
+_SHIFTS = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))  # where squares begin is arbitrary
+_FIRST_STEP_CELLS = 1.0
+_STEP_FACTOR = math.sqrt(2.0)
+_SQUARE_ERROR = 0.05  # of its worth, at least: maps do not agree to the last cell
+_LEAST_ERRORS = 0.5  # a pose d away that is as good tells of s = d, not of infinity
+_EXCLUDED_ERRORS = 2.0  # standard errors by which the maps must speak against a pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseSpread:
+    """How well two maps fix a pose.
+
+    ``covariance`` (3, 3) is of [theta, t_x, t_y] in [rad, cells]. ``weakest_cells`` is the
+    standard deviation in the direction that is fixed the least, at the rim for turns.
+    """
+
+    covariance: FloatArray
+    weakest_cells: float
 
 
 def curvature(problem: GridProblem, pose: FloatArray) -> FloatArray:
@@ -42,30 +63,21 @@ def curvature(problem: GridProblem, pose: FloatArray) -> FloatArray:
     return -0.5 * (hessian + hessian.T)
 
 
-def slide_share(problem: GridProblem, pose: FloatArray, distance_cells: float) -> float:
-    """Objective some cells away in the least curved direction, as a share of that at the pose.
+def pose_spread(
+    problem: GridProblem, pose: FloatArray, sigma_cells: float, seen: Seen
+) -> PoseSpread:
+    """Spread of a pose (3,) at a maximum of the objective.
 
-    Near 1 where the walls leave a direction free, as a straight wall does.
-    """
-    _, vectors = np.linalg.eigh(curvature(problem, pose))
-    step = distance_cells * vectors[:, 0] * (1.0 / problem.radius, 1.0, 1.0)
-    best = max(problem.value(pose), 1e-9)
-    return max(problem.value(pose + step), problem.value(pose - step), 0.0) / best
-
-
-def pose_covariance(
-    problem: GridProblem, pose: FloatArray, sigma_cells: float, slide: float
-) -> FloatArray:
-    """Covariance (3, 3) of [theta, t_x, t_y] in [rad, cells] at a maximum of the objective.
-
-    ``sigma_cells`` is the kernel of the walls, ``slide`` the `slide_share` of the pose.
+    ``sigma_cells`` is the walls' kernel; ``seen`` (R, C) of source and target, in the problem's
+    cells, are zero where a map is unknown.
     """
     scale = np.array([1.0 / problem.radius, 1.0, 1.0])
     pulls, places = problem.point_gradients(pose)
     weights = np.concatenate([problem.source_weights, problem.target_weights])
     is_pulling = np.abs(pulls).sum(axis=1) > 0.0
-    pulls, places, weights = pulls[is_pulling] * scale, places[is_pulling], weights[is_pulling]
     values, vectors = np.linalg.eigh(curvature(problem, pose))
+    free = _free_deviation(problem, pose, vectors[:, 0] * scale, places, seen)
+    pulls, places, weights = pulls[is_pulling] * scale, places[is_pulling], weights[is_pulling]
     # Directions that the maps do not fix at all get the size of the map, not infinity.
     floor = max(float(values.max()), 1e-9) * 1e-5
     inverse = vectors @ np.diag(1.0 / np.maximum(values, floor)) @ vectors.T
@@ -73,9 +85,71 @@ def pose_covariance(
     covariance = inverse @ _scatter(pulls, places) @ inverse
     covariance *= 1.0 + _UNSEEN_PER_CELL2 * strain
     covariance += _FLOOR_CELLS**2 * np.eye(3)
-    if slide > _FREE_SLIDE_SHARE:
-        covariance += problem.radius**2 * np.outer(vectors[:, 0], vectors[:, 0])
-    return np.diag(scale) @ covariance @ np.diag(scale)
+    weakest = vectors[:, 0]
+    known = float(weakest @ covariance @ weakest)
+    covariance += max(free**2 - known, 0.0) * np.outer(weakest, weakest)
+    deviation = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
+    return PoseSpread(np.diag(scale) @ covariance @ np.diag(scale), deviation)
+
+
+def _free_deviation(
+    problem: GridProblem, pose: FloatArray, direction: FloatArray, places: FloatArray, seen: Seen
+) -> float:
+    """Standard deviation [cells] in a direction, from how far off the maps exclude a pose.
+
+    The curvature at a maximum says nothing of poses farther off, which along a corridor are nearly
+    as good. Of a normal distribution, a pose d away is d / (2 s) standard errors less likely; so s
+    is the greatest d / (2 z) up to where z excludes the pose. A wall that only leaves what the
+    other map has seen says nothing against it. The error of the loss is that of the squares' sums,
+    and as if one more square erred by their mean: few squares may all err.
+    """
+    weights = np.concatenate([problem.source_weights, problem.target_weights])
+    squares = []
+    for shift in _SHIFTS:
+        index = _squares(places, _BLOCK_CELLS, shift)
+        squares.append((index, _SQUARE_ERROR**2 * float((np.bincount(index, weights) ** 2).sum())))
+    here = problem.point_values(pose)
+    found, step = 0.0, _FIRST_STEP_CELLS
+    while step < 2.0 * problem.radius:
+        errors = math.inf
+        for sign in (1.0, -1.0):
+            moved = pose + sign * step * direction
+            lost = np.where(
+                _is_seen(problem, moved, seen), here - problem.point_values(moved), 0.0
+            )
+            errors = min(errors, _standard_errors(lost, squares))
+        found = max(found, 0.5 * step / max(errors, _LEAST_ERRORS))
+        if errors >= _EXCLUDED_ERRORS:
+            return found
+        step *= _STEP_FACTOR
+    return max(found, problem.radius)
+
+
+def _is_seen(problem: GridProblem, pose: FloatArray, seen: Seen) -> NDArray[np.bool_]:
+    """Which points (M + N,), the source's first, lie on what the other map has seen."""
+    found = []
+    for cells, grid in zip(problem.point_places(pose), (seen[1], seen[0]), strict=True):
+        col, row = np.rint(cells).astype(np.int64).T
+        inside = (row >= 0) & (col >= 0) & (row < grid.shape[0]) & (col < grid.shape[1])
+        inside[inside] = grid[row[inside], col[inside]] > 0
+        found.append(inside)
+    return np.concatenate(found)
+
+
+def _standard_errors(values: FloatArray, squares: list[tuple[NDArray[np.intp], float]]) -> float:
+    """Sum of values (N,) over its standard error, from the sums over squares of each shift.
+
+    ``squares`` are the number of each value's square (N,) and the least variance of the sum.
+    """
+    total = float(values.sum())
+    variance = 0.0
+    for index, least in squares:
+        sums = np.bincount(index, weights=values)
+        sums = sums[sums != 0.0]
+        count = max(len(sums), 1)
+        mean = total / count
+        variance += least + mean**2 + float(((sums - mean) ** 2).sum()) * count / max(count - 1, 1)
+    return total / math.sqrt(variance / len(squares))
 
 
 def _squares(places: FloatArray, side: float, shift: tuple[float, float]) -> NDArray[np.intp]:
@@ -92,11 +166,10 @@ def _sums(values: FloatArray, index: NDArray[np.intp]) -> FloatArray:
 def _scatter(pulls: FloatArray, places: FloatArray) -> FloatArray:
     """Covariance (3, 3) of the sum of all pulls (N, 3), from that of the squares' sums."""
     total = np.zeros((3, 3))
-    shifts = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))  # where squares begin is arbitrary
-    for shift in shifts:
+    for shift in _SHIFTS:
         sums = _sums(pulls, _squares(places, _BLOCK_CELLS, shift))
         total += sums.T @ sums * (len(sums) / max(len(sums) - 3, 1))
-    return total / len(shifts)
+    return total / len(_SHIFTS)
 
 
 def _mean_square_displacement(

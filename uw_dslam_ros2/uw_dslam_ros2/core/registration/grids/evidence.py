@@ -15,7 +15,8 @@ from uw_dslam_ros2.core.registration.grids.candidates import (
     climb,
     log_volume,
 )
-from uw_dslam_ros2.core.registration.grids.covariance import slide_share
+from uw_dslam_ros2.core.registration.grids.covariance import PoseSpread, pose_spread
+from uw_dslam_ros2.core.registration.grids.preparation import FINE_SIGMA_CELLS
 from uw_dslam_ros2.core.registration.grids.probability import (
     MatchEvidence,
     PoseEvidence,
@@ -29,15 +30,18 @@ __all__ = ["Found", "Judge", "is_same_pose", "refine", "weigh"]
 
 FloatArray = NDArray[np.float64]
 _NUM_REFINED = 12
-_SLIDE_CELLS = 10.0
 _SAME_CELLS = 8.0  # poses nearer than that, in cells of their level, are one answer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Poses of the finest level, best first, the evidence, and what chance reaches."""
+    """Poses of the finest level, best first, how well the first is fixed, and the evidence.
+
+    ``background`` is what chance reaches.
+    """
 
     refined: list[Candidate]
+    spread: PoseSpread
     evidence: MatchEvidence
     background: Background
 
@@ -83,13 +87,21 @@ def weigh(
     best, _ = weighed[0]
     apart = [p for p in weighed[1:] if not is_same_pose(finest, p[0].pose, best.pose)]
     refined, poses = zip(weighed[0], *apart, strict=True)
+    seen = (sides[0].seen, sides[1].seen)
+    spread = pose_spread(finest, best.pose, FINE_SIGMA_CELLS, seen)
     evidence = MatchEvidence(
         best=poses[0],
         rivals=poses[1:],
-        slide_share=slide_share(finest, best.pose, _SLIDE_CELLS),
+        deviation_m=spread.weakest_cells * finest.resolution_m,
+        extent_m=min(_extent(side) for side in sides) * finest.resolution_m,
         log_volume=volume,
     )
-    return Found(list(refined), evidence, background)
+    return Found(list(refined), spread, evidence, background)
+
+
+def _extent(side: WallMap) -> float:
+    """Root mean square distance of a map's walls from their mean [cells]."""
+    return math.sqrt(float(side.points.var(axis=0).sum()))
 
 
 def refine(pyramid: Pyramid, candidates: list[Candidate], limit: int) -> list[Candidate]:

@@ -44,14 +44,16 @@ class PoseEvidence:
 class MatchEvidence:
     """What is known about the best pose of two maps, the most convincing one, and its rivals.
 
-    ``slide_share`` is the score some cells off in the least curved direction over the best one.
-    ``log_volume`` is the logarithm of the number of poses that were searched: the more there are,
-    the better the best of them is by chance.
+    ``deviation_m`` is the best pose's standard deviation in the direction that is fixed the least,
+    at the rim for turns; ``extent_m`` the root mean square distance of the walls of the smaller
+    map from their mean. ``log_volume`` is the logarithm of the number of poses that were searched:
+    the more there are, the better the best of them is by chance.
     """
 
     best: PoseEvidence
     rivals: tuple[PoseEvidence, ...]
-    slide_share: float
+    deviation_m: float
+    extent_m: float
     log_volume: float
 
     @property

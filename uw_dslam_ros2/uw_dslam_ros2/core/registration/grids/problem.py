@@ -87,6 +87,22 @@ class GridProblem:
         """Gradient (3,) of the objective [1 / rad, 1 / cell, 1 / cell]."""
         return self._sum.value_at(pose)[1]
 
+    def point_places(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where the points lie in the other map's cells: source's (M, 2), and target's (N, 2)."""
+        turn = SE2(0.0, 0.0, float(pose[0])).rotation()
+        behind = (self.target_points - pose[1:]) @ turn + self.center
+        return self.source_points @ turn.T + pose[1:], behind
+
+    def point_values(self, pose: FloatArray) -> FloatArray:
+        """Each point's part of the objective (M + N,), the source's points first."""
+        ahead, behind = self.point_places(pose)
+        return np.concatenate(
+            [
+                self.source_weights * self.target_field.values(ahead),
+                self.target_weights * self.source_field.values(behind),
+            ]
+        )
+
     def point_gradients(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Each point's part of the gradient (M + N, 3), and its place in target cells (M + N, 2).
 

@@ -14,12 +14,11 @@ from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grids.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.covariance import pose_covariance
 from uw_dslam_ros2.core.registration.grids.crop import crop_to_known
 from uw_dslam_ros2.core.registration.grids.evidence import Found, weigh
 from uw_dslam_ros2.core.registration.grids.frames import GridFrames
 from uw_dslam_ros2.core.registration.grids.paper import register_grids_by_points
-from uw_dslam_ros2.core.registration.grids.preparation import FINE_SIGMA_CELLS, prepare_maps
+from uw_dslam_ros2.core.registration.grids.preparation import prepare_maps
 from uw_dslam_ros2.core.registration.grids.probability import (
     MatchEvidence,
     PoseEvidence,
@@ -247,11 +246,7 @@ class _GridMatch:
             verdict=verdict,
             reason=reason,
             T_target_source=motion,
-            covariance=self._frames.covariance(
-                finest,
-                pose_covariance(finest, pose, FINE_SIGMA_CELLS, found.evidence.slide_share),
-                motion,
-            ),
+            covariance=self._frames.covariance(finest, found.spread.covariance, motion),
             probability=probability,
             score=score,
             lower_bound=outcome.lower_bound,

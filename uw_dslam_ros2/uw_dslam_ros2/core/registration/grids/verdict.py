@@ -23,6 +23,7 @@ __all__ = ["Proof", "decide"]
 
 _IMPROBABLE_CONFLICT = 0.6  # of the conflict allowed, where a match is not probable either
 _LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
+_MOST_DEVIATION = 0.15  # of a pose in its weakest direction, share of the walls' extent
 _DOUBTED = 0.5  # most probability left to a pose that the maps do not tell from others
 
 
@@ -66,6 +67,11 @@ class _Case:
         self.max_conflict = config.max_conflict
         if not self.is_probable:
             self.max_conflict *= _IMPROBABLE_CONFLICT
+
+    @property
+    def most_deviation_m(self) -> float:
+        """More is no pose, not even of a corridor."""
+        return _MOST_DEVIATION * self.evidence.extent_m
 
     @property
     def alone(self) -> float:
@@ -137,11 +143,11 @@ _RULES: tuple[Rule[_Case, Verdict], ...] = (
         lambda c: f"the maps hold too little to judge their best alignment by: {c.not_finite}",
     ),
     Rule(
-        lambda c: c.evidence.slide_share > c.config.max_slide_share,
+        lambda c: c.evidence.deviation_m > c.most_deviation_m,
         Verdict.AMBIGUOUS,
         lambda c: (
-            "the walls leave one direction free, as a straight wall does: some cells away the "
-            f"score is still {at_most(c.evidence.slide_share, c.config.max_slide_share)}"
+            "the walls leave one direction free, as a straight wall does: standard deviation "
+            f"in metres {at_most(c.evidence.deviation_m, c.most_deviation_m, '.2f')}"
         ),
         most_probability=_DOUBTED,
     ),
@@ -236,7 +242,8 @@ def decide(
 def _not_finite(evidence: MatchEvidence, proof: Proof) -> Iterator[str]:
     """What is not a finite number, with its value."""
     numbers = [
-        ("the score some cells away", evidence.slide_share),
+        ("the standard deviation", evidence.deviation_m),
+        ("the extent of the walls", evidence.extent_m),
         ("the number of poses searched", evidence.log_volume),
         ("the score in the search", proof.score),
         ("the lower bound", proof.lower_bound),
