@@ -8,11 +8,15 @@ from closeness import are_near
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.metrics import resample
 from uw_dslam_ros2.core.registration.baselines import (
     PEERS,
+    akaze_ransac,
     available_peers,
     correlative,
+    fourier_mellin,
     go_icp,
+    hough_spectrum,
     icp,
     many_start_icp,
     ndt,
@@ -184,6 +188,33 @@ def test_orb_ransac_on_an_empty_map_finds_nothing():
     coarse = OccupancyMap(GridSpec(0.1, 100, 100), np.full((100, 100), -1, dtype=np.int8))
     with pytest.raises(InvalidInputError, match="resolution"):
         orb_ransac(coarse, rooms())
+
+
+@pytest.mark.parametrize("method", [akaze_ransac, fourier_mellin, hough_spectrum])
+@pytest.mark.parametrize("yaw", [0.4, 2.5])
+def test_methods_on_images_find_a_turned_map(method, yaw):
+    """The same cells, drawn anew in a frame that is turned: right to a degree and some cells."""
+    source = rooms(SE2(1.0, 2.0, 0.0))
+    spec = GridSpec(0.05, 330, 330, SE2(-4.0, 0.5, 0.0))
+    middle = SE2(*spec.T_frame_grid.apply(np.array([8.0, 8.0])).tolist())
+    own = SE2(*source.spec.corners().mean(axis=0).tolist())
+    expected = middle @ SE2(yaw=yaw) @ own.inverse()
+    target = OccupancyMap(spec, resample(source, spec, expected))
+    found = method(source, target)
+    assert found.T_target_source is not None
+    error_m = np.hypot(*(found.T_target_source.apply(own.as_array()[:2])
+                         - expected.apply(own.as_array()[:2])))  # fmt: skip
+    assert error_m < 0.25
+    assert found.T_target_source.distance_to(expected)[1] < math.radians(1.0)
+
+
+@pytest.mark.parametrize("method", [akaze_ransac, fourier_mellin, hough_spectrum])
+def test_methods_on_images_find_nothing_in_an_empty_map(method):
+    blank = OccupancyMap(GridSpec(0.05, 100, 100), np.full((100, 100), -1, dtype=np.int8))
+    assert method(blank, rooms()).T_target_source is None
+    coarse = OccupancyMap(GridSpec(0.1, 100, 100), np.full((100, 100), -1, dtype=np.int8))
+    with pytest.raises(InvalidInputError, match="resolution"):
+        method(coarse, rooms())
 
 
 @pytest.mark.parametrize("name", list(PEERS))
