@@ -32,6 +32,7 @@ from uw_dslam_ros2.cli.studies._common import (
     share_interval,
     write_csv,
 )
+from uw_dslam_ros2.cli.studies._map_methods import add_method_arguments, compare
 from uw_dslam_ros2.cli.studies._map_pairs import registered
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.sim.map_pairs import MapPair
@@ -54,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cache", type=Path, metavar="DIR", help="folder of the maps (default: in --out)"
     )
+    add_method_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -76,6 +78,9 @@ def run(args: argparse.Namespace) -> int:
     seconds = [row["seconds"] for row in rows]
     print(f"time: median {np.median(seconds):.2f} s, p95 {np.quantile(seconds, 0.95):.2f} s")
     _draw(args.out / "apart.png", rows)
+    if args.methods:
+        plain = [pair for pair, group in pairs if group != "twins" and not pair.is_ambiguous]
+        write_csv(args.out / "methods.csv", compare(plain, args.methods))
     return 0
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.studies._common import print_table, progress, write_csv
+from uw_dslam_ros2.cli.studies._map_methods import add_method_arguments, compare
 from uw_dslam_ros2.cli.studies._map_pairs import (
     SHARES,
     accepted_of_different,
@@ -49,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--places", type=int, default=1, help="per map, overlap (%(default)s)")
     parser.add_argument("--overlaps", nargs="+", type=float, default=[0.7, 0.5, 0.3])
     parser.add_argument("--noises", nargs="+", default=list(NOISES), choices=list(NOISES))
+    add_method_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -68,6 +70,8 @@ def run(args: argparse.Namespace) -> int:
     print(accepted_of_different(rows))
     seconds = [r["seconds"] for r in rows]
     print(f"time: median {np.median(seconds):.2f} s, p90 {np.quantile(seconds, 0.9):.2f} s")
+    if args.methods:
+        write_csv(args.out / "methods.csv", compare(pairs, args.methods))
     return 0
 
 
