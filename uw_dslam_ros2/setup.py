@@ -7,7 +7,17 @@ from setuptools import find_packages, setup
 
 NAME = "uw_dslam_ros2"
 NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
-COMMANDS = ("simulate", "offline", "doctor", "merge", "register", "evaluate", "study", "convert")
+COMMANDS = (
+    "simulate",
+    "offline",
+    "doctor",
+    "merge",
+    "register",
+    "evaluate",
+    "study",
+    "convert",
+    "view",
+)
 
 # The settings live at the top of the repository and are installed with the package built there.
 CONFIG = sorted(glob("../config/*.yaml")) if Path("../config").is_dir() else []
@@ -16,7 +26,9 @@ setup(
     name=NAME,
     version="0.1.0",
     packages=find_packages(exclude=["test"]),
-    package_data={NAME: ["py.typed", "cli/templates/*"]},
+    package_data={
+        NAME: ["py.typed", "cli/templates/*", "view/static/*", "view/static/vendor/leaflet/*"]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -14,9 +14,10 @@ PACKAGE = ROOT / NAME / NAME
 
 # A room, and the rooms that nothing in it may import. Paths below the package, in dots.
 CLOSED = {
-    "core": {"io", "sim", "ros", "cli"},
-    "io": {"sim", "ros", "cli"},
-    "sim": {"ros", "cli"},
+    "core": {"io", "sim", "view", "ros", "cli"},
+    "io": {"sim", "view", "ros", "cli"},
+    "sim": {"view", "ros", "cli"},
+    "view": {"io", "sim", "ros", "cli"},
     "ros": {"sim", "cli"},
     "ros.convert": {"ros.plumbing", "ros.nodes"},
     "ros.plumbing": {"ros.nodes"},

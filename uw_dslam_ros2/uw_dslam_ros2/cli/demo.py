@@ -29,7 +29,7 @@ from uw_dslam_ros2.cli.scoring import Scores, Truth, read_truth
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import MapQueueConfig
 from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
-from uw_dslam_ros2.io.session import load_session
+from uw_dslam_ros2.io.session import SESSION_FOLDER, load_session
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
 from uw_dslam_ros2.sim.recording import simulate_mission
@@ -150,7 +150,7 @@ def _run(args: argparse.Namespace) -> int:
     recordings = _convert(args, out, steps) if args.dataset else _simulate(args, out, steps)
     notes = _replay(args, out, recordings, steps)
     steps.begin("writing the report", "writing maps, pictures and report")
-    outcome = outcome_of(load_session(out / "session", _queue_config(recordings)))
+    outcome = outcome_of(load_session(out / SESSION_FOLDER, _queue_config(recordings)))
     steps.end()
     facts = RunFacts(
         title=recordings.title,
@@ -276,7 +276,7 @@ def _replay(
             is_settled = _settle(control, steps)
             steps.begin("saving", "saving through the manager's services")
             problem = control.save_map(str(out / "global_map"))
-            control.save_session(str(out / "session"))
+            control.save_session(str(out / SESSION_FOLDER))
     notes = [f"The manager saved no map: {problem}."] if problem else []
     if not is_settled:
         notes.append(

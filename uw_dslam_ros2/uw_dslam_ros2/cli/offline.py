@@ -17,6 +17,7 @@ from uw_dslam_ros2.cli.scoring import Truth, read_truth
 from uw_dslam_ros2.core.errors import ConfigError, DataError, NothingMappedError
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
+from uw_dslam_ros2.io.session import SESSION_FOLDER, save_session
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import find_recordings
 
@@ -130,6 +131,7 @@ def _run(args: argparse.Namespace) -> int:
     for note in facts.notes:
         print(f"warning: {note}", file=sys.stderr, flush=True)
     outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
+    save_session(args.out / SESSION_FOLDER, queue)  # for view, and to go on from
     scores = write_report(args.out, outcome, facts, truth, has_pictures=not args.no_report)
     done_s = time.monotonic()
     say(

@@ -49,6 +49,7 @@ from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum
 __all__ = [
     "GOOD_FILE",
     "SESSION_FILE",
+    "SESSION_FOLDER",
     "UNSURE_EDGE",
     "Session",
     "SessionInUseError",
@@ -61,6 +62,8 @@ __all__ = [
 SESSION_FILE = "session.sqlite"
 GOOD_FILE = "session.good.sqlite"
 """Copy of the session as it was read, whole, at the last start."""
+SESSION_FOLDER = "session"
+"""Where a result folder of ``offline`` or ``demo`` keeps its session."""
 UNSURE_EDGE = "refused by itself; believed because others agree with it"
 """Comment on an edge of a pose graph."""
 _LOCK_FILE = "session.lock"

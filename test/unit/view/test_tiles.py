@@ -1,0 +1,60 @@
+"""Tiles of maps: every pixel shows the cell that lies under its middle."""
+
+import cv2
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.view.tiles import TILE_PIXELS, Layer, colours_of_percent, tile_png
+
+
+def decoded(png):
+    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)[:, :, [2, 1, 0, 3]]
+
+
+def random_map(rng, rows=90, cols=120, pose=SE2()):
+    values = rng.choice([-1, 0, 50, 100], size=(rows, cols)).astype(np.int8)
+    return OccupancyMap(GridSpec(0.25, rows, cols, pose), values)
+
+
+@pytest.mark.parametrize("zoom", [2, 3, 4])  # down to a pixel a cell
+def test_pixels_show_the_cell_under_them(rng, zoom):
+    occupancy = random_map(rng, pose=SE2(1.3, -2.1, 0.4))
+    layer = Layer(occupancy, SE2(5.0, 7.0, -1.0))
+    colours = colours_of_percent()
+    pixel_m = 2.0**-zoom
+    num_shown = 0
+    for col, row in ((0, 0), (0, -1), (-1, -1), (1, -1)):
+        png = tile_png([layer], zoom, col, row)
+        picture = (
+            np.zeros((TILE_PIXELS, TILE_PIXELS, 4), np.uint8) if png is None else decoded(png)
+        )
+        for i, j in rng.integers(0, TILE_PIXELS, (200, 2)):
+            x, y = col * TILE_PIXELS + j + 0.5, -(row * TILE_PIXELS + i + 0.5)
+            place = np.array([[x, y]]) * pixel_m
+            cells = occupancy.spec.cells_of(layer.T_view_map.inverse().apply(place))
+            expected = np.zeros(4, np.uint8)
+            if occupancy.spec.contains(cells)[0]:
+                expected = colours[occupancy.values[cells[0, 0], cells[0, 1]] + 1]
+            if expected[3]:
+                num_shown += 1
+                np.testing.assert_array_equal(picture[i, j], expected)
+            else:
+                assert picture[i, j, 3] == 0
+    assert num_shown > 10
+
+
+def test_walls_outlast_a_coarse_zoom():
+    values = np.zeros((1000, 1000), np.int8)
+    values[500] = 100
+    layer = Layer(OccupancyMap(GridSpec(0.05, 1000, 1000), values))
+    picture = decoded(tile_png([layer], 0, 0, -1))
+    is_dark = (picture[:, :, 0] < 100) & (picture[:, :, 3] > 0)
+    assert is_dark[:, 10:40].any(axis=0).all()  # a quay of one cell is seen at a pixel a metre
+
+
+def test_nothing_known_is_no_tile():
+    unknown = OccupancyMap(GridSpec(0.1, 10, 10), np.full((10, 10), -1, np.int8))
+    assert tile_png([Layer(unknown)], 3, 0, -1) is None
+    assert tile_png([], 3, 0, 0) is None

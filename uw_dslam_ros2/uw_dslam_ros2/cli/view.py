@@ -1,0 +1,69 @@
+"""``view SESSION``: a saved merge in the browser."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from uw_dslam_ros2.cli.common import parser_for, run_command
+from uw_dslam_ros2.io.session import SESSION_FOLDER, load_session
+from uw_dslam_ros2.view.queue_source import QueueSource
+from uw_dslam_ros2.view.server import ViewServer
+
+__all__ = ["main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Serve until interrupted."""
+    args = _parser().parse_args(argv)
+    return run_command("view", lambda: _run(args))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = parser_for(
+        "view",
+        "Show a saved merge in the browser: the global map, vehicles, submaps, constraints, and\n"
+        "each registration with both maps laid on each other.",
+        "view result",
+    )
+    parser.add_argument(
+        "session",
+        type=Path,
+        metavar="FOLDER",
+        help="result of offline or demo, or a session that map_queue_manager saved",
+    )
+    parser.add_argument(
+        "--address",
+        default="127.0.0.1",
+        help="where to listen; another than this machine's own "
+        "(127.0.0.1) asks browsers for a token",
+    )
+    parser.add_argument("--port", type=int, default=8080, help="0: any that is free")
+    parser.add_argument("--token", default="", help="drawn at random where one is needed")
+    return parser
+
+
+def _run(args: argparse.Namespace) -> int:
+    folder = args.session
+    holder = folder / SESSION_FOLDER if (folder / SESSION_FOLDER).is_dir() else folder
+    source = QueueSource(folder.resolve().name, load_session(holder))
+    server = ViewServer(source, args.address, args.port, args.token)
+    asyncio.run(_serve(server))
+    return 0
+
+
+async def _serve(server: ViewServer) -> None:
+    done = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, done.set)
+    print(f"view: {await server.start()}   (Ctrl+C ends it)", flush=True)
+    await done.wait()
+    await server.stop()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

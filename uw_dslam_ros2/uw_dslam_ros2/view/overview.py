@@ -1,0 +1,150 @@
+"""What the page shows of a merge: vehicles, submaps, constraints and groups, as plain values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.merging import Constraint, ConstraintKind, SubmapRecord, SubmapState
+from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId, track_name
+
+__all__ = [
+    "constraint_row",
+    "outline_of",
+    "registration_row",
+    "submap_row",
+    "vehicle_rows",
+]
+
+FloatArray = NDArray[np.float64]
+
+_OUTLINE_CELL_M = 0.5
+_TRACK_STEP_M = 0.2
+
+
+def outline_of(occupancy: OccupancyMap) -> FloatArray:
+    """Rim (K, 2) [m] of the largest patch that was seen, in the map's frame; K may be 0."""
+    spec = occupancy.spec
+    step = max(1, round(_OUTLINE_CELL_M / spec.resolution_m))
+    rows, cols = -(-spec.num_rows // step), -(-spec.num_cols // step)
+    known = np.zeros((rows * step, cols * step), bool)
+    known[: spec.num_rows, : spec.num_cols] = occupancy.known
+    coarse = known.reshape(rows, step, cols, step).any(axis=(1, 3)).astype(np.uint8)
+    rims, _ = cv2.findContours(coarse, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if not rims:
+        return np.empty((0, 2))
+    largest = max(rims, key=cv2.contourArea)
+    rim = cv2.approxPolyDP(largest, 1.0, True).reshape(-1, 2).astype(np.float64)
+    return spec.T_frame_grid.apply((rim + 0.5) * step * spec.resolution_m)
+
+
+def vehicle_rows(
+    records: Sequence[SubmapRecord], T_view_group: Mapping[int, SE2]
+) -> list[dict[str, Any]]:
+    """Each run of each vehicle with its track, one piece for each submap, oldest first."""
+    rows: dict[str, dict[str, Any]] = {}
+    for record in records:
+        submap = record.submap
+        name = track_name(submap.submap_id.track)
+        row = rows.setdefault(
+            name, {"name": name, "num_submaps": 0, "num_merged": 0, "reason": "", "track": []}
+        )
+        row["num_submaps"] += 1
+        is_merged = record.state is SubmapState.MERGED
+        row["num_merged"] += is_merged
+        if not is_merged or not row["reason"]:
+            row["reason"] = record.reason
+        row["newest_s"] = max(row.get("newest_s", 0.0), submap.stamp_ns * 1e-9)
+        if record.state is not SubmapState.WITHDRAWN and len(submap.trajectory):
+            motion = T_view_group[record.component] @ record.T_component_submap
+            row["track"].append(
+                {
+                    "submap": str(submap.submap_id),
+                    "xy": _thinned(motion.apply(submap.trajectory[:, :2])),
+                }
+            )
+    return [rows[name] for name in sorted(rows)]
+
+
+def submap_row(record: SubmapRecord, outline: FloatArray, T_view_group: SE2) -> dict[str, Any]:
+    """One submap."""
+    submap = record.submap
+    motion = T_view_group @ record.T_component_submap
+    return {
+        "name": str(submap.submap_id),
+        "vehicle": track_name(submap.submap_id.track),
+        "state": record.state.name.lower(),
+        "group": record.component,
+        "revision": submap.revision,
+        "is_final": submap.is_final,
+        "stamp_s": submap.stamp_ns * 1e-9,
+        "reason": record.reason,
+        "at": _rounded(motion.as_array()),
+        "outline": _rounded(motion.apply(outline)) if len(outline) else [],
+    }
+
+
+def constraint_row(
+    constraint: Constraint, places: Mapping[SubmapId, tuple[int, SE2]]
+) -> dict[str, Any] | None:
+    """One edge of the pose graph between two submaps that are shown, else None."""
+    if constraint.source not in places or constraint.target not in places:
+        return None
+    (group, source), (other, target) = places[constraint.source], places[constraint.target]
+    return {
+        "kind": "odometry" if constraint.kind is ConstraintKind.ODOMETRY else "registration",
+        "source": str(constraint.source),
+        "target": str(constraint.target),
+        "group": group if group == other else None,
+        "line": _rounded(np.array([[source.x, source.y], [target.x, target.y]])),
+        "residual_m": _number(constraint.residual_m),
+        "residual_deg": _number(math.degrees(constraint.residual_rad)),
+        "is_inlier": constraint.is_inlier,
+        "is_unsure": constraint.is_unsure,
+    }
+
+
+def registration_row(
+    number: int, answer: Answer, is_used: bool, names: Mapping[str, str]
+) -> dict[str, Any]:
+    """One answer in a line; `names` are those of its ``source`` and ``target``."""
+    motion, numbers = answer.T_target_source, answer.numbers
+    sigma = np.sqrt(np.maximum(np.diag(answer.covariance), 0.0))
+    return {
+        "number": number,
+        **names,
+        "verdict": answer.verdict.name,
+        "reason": answer.why,
+        "is_used": is_used,
+        "probability": _number(answer.probability),
+        "pose": None if motion is None else _rounded(motion.as_array(), 4),
+        "sigma": [_number(value) for value in sigma],
+        "numbers": {name: _number(value) for name, value in sorted(numbers.items())},
+        "submaps": sorted({str(i) for i in (*answer.query.source.ids, *answer.query.target.ids)}),
+    }
+
+
+def _thinned(points: FloatArray) -> list[list[float]]:
+    """Points at least so far apart, the last one kept."""
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    bins = np.floor(length / _TRACK_STEP_M)
+    keep = np.concatenate([[True], bins[1:] != bins[:-1]])
+    keep[-1] = True
+    return _rounded(points[keep])
+
+
+def _rounded(values: FloatArray, digits: int = 3) -> Any:
+    return np.round(values, digits).tolist()
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return round(float(value), 6) if math.isfinite(value) else None

@@ -1,0 +1,106 @@
+"""A look into one answer: both maps laid on each other, and where their walls agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.mosaic import Window
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.view.tiles import png_bytes
+
+__all__ = ["PAIR_LAYERS", "Pair", "lay_on"]
+
+ByteArray = NDArray[np.uint8]
+
+PAIR_LAYERS = ("target", "source", "agreement")
+_WALL_PERCENT, _FREE_PERCENT = 65, 20
+_REACH_CELLS = 2
+"""Walls so near are the same wall to the eye: their own thickness."""
+_MARGIN_CELLS = 4
+# Okabe and Ito's colours, which colour-blind people tell apart: red, green, blue, opacity.
+_COLOURS = {
+    "free": (226, 232, 237, 255),
+    "target": (86, 180, 233, 255),
+    "source": (230, 159, 0, 255),
+    "agree": (0, 78, 56, 255),
+    "conflict": (204, 40, 0, 255),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Two maps on one lattice, int8 (R, C) each as in `OccupancyMap`; rows grow with y."""
+
+    spec: GridSpec
+    target: NDArray[np.int8]
+    source: NDArray[np.int8]
+
+    def picture(self, layer: str) -> bytes:
+        """PNG of one layer, north up; see `PAIR_LAYERS`."""
+        if layer == "agreement":
+            rgba = self._agreement()
+        else:
+            values = self.target if layer == "target" else self.source
+            rgba = np.zeros((*values.shape, 4), np.uint8)
+            rgba[values >= 0] = _COLOURS["free"]
+            rgba[values >= _WALL_PERCENT] = _COLOURS[layer]
+        return png_bytes(np.ascontiguousarray(rgba[::-1]))
+
+    def _agreement(self) -> ByteArray:
+        walls = self.target >= _WALL_PERCENT, self.source >= _WALL_PERCENT
+        maps = self.target, self.source
+        rgba = np.zeros((*self.target.shape, 4), np.uint8)
+        rgba[(self.target >= 0) | (self.source >= 0)] = _COLOURS["free"]
+        side = 2 * _REACH_CELLS + 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        near = [cv2.dilate(wall.astype(np.uint8), kernel).astype(bool) for wall in walls]
+        for own, other, name in ((0, 1, "target"), (1, 0, "source")):
+            rgba[walls[own]] = _COLOURS[name]
+            is_free = (maps[other] >= 0) & (maps[other] <= _FREE_PERCENT)
+            rgba[walls[own] & is_free & ~near[other]] = _COLOURS["conflict"]
+        rgba[(walls[0] & near[1]) | (walls[1] & near[0])] = _COLOURS["agree"]
+        return rgba
+
+
+def lay_on(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> Pair:
+    """Lay the source on the target's lattice, which grows to hold both."""
+    spec = target.spec
+    # Corners of the source in cells of the target.
+    T_grid_source = spec.T_frame_grid.inverse() @ T_target_source
+    corners = T_grid_source.apply(source.spec.corners()) / spec.resolution_m
+    low = np.floor(np.minimum(corners.min(axis=0), 0.0)).astype(int) - _MARGIN_CELLS
+    size = np.array([spec.num_cols, spec.num_rows])
+    high = np.ceil(np.maximum(corners.max(axis=0), size)).astype(int) + _MARGIN_CELLS
+    window = Window(int(low[1]), int(low[0]), int(high[1]), int(high[0]))
+    corner = SE2(window.col_0 * spec.resolution_m, window.row_0 * spec.resolution_m)
+    laid = GridSpec(spec.resolution_m, *window.shape, spec.T_frame_grid @ corner)
+    own = np.full(laid.shape, UNKNOWN, np.int8)
+    own[
+        -window.row_0 : spec.num_rows - window.row_0, -window.col_0 : spec.num_cols - window.col_0
+    ] = target.values
+    return Pair(laid, own, _resampled(source, T_target_source.inverse(), laid))
+
+
+def _resampled(source: OccupancyMap, T_source_target: SE2, laid: GridSpec) -> NDArray[np.int8]:
+    T = source.spec.T_frame_grid.inverse() @ T_source_target @ laid.T_frame_grid
+    scale = laid.resolution_m / source.spec.resolution_m
+    c, s = np.cos(T.yaw) * scale, np.sin(T.yaw) * scale
+    x, y = T.x / source.spec.resolution_m, T.y / source.spec.resolution_m
+    # Centres to centres: a cell's middle lies half a cell from its corner on both sides.
+    matrix = np.array(
+        [[c, -s, x + 0.5 * (c - s) - 0.5], [s, c, y + 0.5 * (s + c) - 0.5]], dtype=np.float64
+    )
+    found = cv2.warpAffine(
+        (source.values.astype(np.int16) + 1).astype(np.uint8),
+        matrix,
+        (laid.num_cols, laid.num_rows),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
+    return (found.astype(np.int16) - 1).astype(np.int8)

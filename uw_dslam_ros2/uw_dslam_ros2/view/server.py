@@ -1,0 +1,311 @@
+"""The web server of the view: one page, its data, tiles of maps; nothing from elsewhere."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import hmac
+import ipaddress
+import json
+import secrets
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
+from typing import Any, Protocol
+
+from aiohttp import web
+
+from uw_dslam_ros2.core.errors import InvalidInputError, UwDslamError
+from uw_dslam_ros2.view.pairs import PAIR_LAYERS, Pair
+from uw_dslam_ros2.view.showing import Register, Showing
+from uw_dslam_ros2.view.tiles import tile_png
+
+__all__ = ["Source", "ViewServer", "is_loopback"]
+
+_COOKIE = "uw_view_token"
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
+        "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+_MAX_ZOOM, _MIN_ZOOM = 10, -8
+_MAX_PAIRS = 8
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Source(Protocol):
+    """Where what is shown comes from: a session on disk, or a running graph."""
+
+    @property
+    def title(self) -> str:
+        """What it is, for the page's head."""
+
+    def showing(self) -> Showing:
+        """The newest state."""
+
+    def status(self) -> dict[str, Any]:
+        """What changes without the map changing: ages, diagnostics, bytes on the link."""
+
+    def register(self) -> Register:
+        """How a pair is registered once more."""
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only this machine reaches an address.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is no address.
+    """
+    if address == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError as error:
+        raise InvalidInputError(
+            f"address is {address!r}, expected an IP address such as 127.0.0.1, or localhost"
+        ) from error
+
+
+class ViewServer:
+    """Serves one source.
+
+    Parameters
+    ----------
+    address, port
+        Where to listen; port 0 takes a free one.
+    token
+        What a browser must know; drawn at random where another machine may reach the address
+        and none is given. None on the loopback address: nobody is asked.
+    """
+
+    def __init__(
+        self, source: Source, address: str = "127.0.0.1", port: int = 0, token: str = ""
+    ) -> None:
+        self._source, self._address, self._port = source, address, port
+        self._token = token or ("" if is_loopback(address) else secrets.token_urlsafe(16))
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="view")
+        self._changed = asyncio.Condition()
+        self._runner: web.AppRunner | None = None
+        self._pairs: dict[tuple[str, int, int | None], Pair] = {}
+        self._is_closing = False
+
+    async def start(self) -> str:
+        """Listen; returns the page's address for a browser."""
+        app = web.Application(middlewares=[self._guard])
+        app.add_routes(
+            [
+                web.get("/", self._page),
+                web.get("/static/{name:[a-z_/]+\\.(?:js|css)}", self._static),
+                web.get("/api/scene", self._scene),
+                web.get("/api/status", self._status),
+                web.get("/api/events", self._events),
+                web.get("/api/cell", self._cell),
+                web.get("/api/tiles/{version}/{moment}/{zoom}/{col}/{row}.png", self._tile),
+                web.get("/api/pairs/{number}", self._pair),
+                web.get("/api/pairs/{number}/rivals", self._rivals),
+                web.get("/api/pairs/{number}/{layer}.png", self._pair_picture),
+            ]
+        )
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, self._address, self._port)
+        try:
+            await site.start()
+        except OSError as error:
+            raise InvalidInputError(
+                f"cannot listen on {self._address} port {self._port}: {error.strerror}"
+            ) from error
+        port = self._runner.addresses[0][1]
+        host = f"[{self._address}]" if ":" in self._address else self._address
+        query = f"/?token={self._token}" if self._token else "/"
+        return f"http://{host}:{port}{query}"
+
+    async def notify(self) -> None:
+        """Tell all pages that something has changed."""
+        async with self._changed:
+            self._changed.notify_all()
+
+    async def stop(self) -> None:
+        """Close."""
+        self._is_closing = True
+        await self.notify()
+        if self._runner is not None:
+            await self._runner.cleanup()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse other sites' pages and strangers; tell mistakes in a sentence."""
+        refused = self._refusal(request)
+        if refused is not None:
+            return refused
+        try:
+            response = await handler(request)
+        except (UwDslamError, ValueError) as error:
+            response = web.json_response({"error": str(error)}, status=400)
+        if not response.prepared:
+            response.headers.update(_HEADERS)
+            response.headers.setdefault("Cache-Control", "no-store")
+        return response
+
+    def _refusal(self, request: web.Request) -> web.Response | None:
+        host = request.host.rsplit(":", 1)[0].strip("[]")
+        if not self._token and not (host == "localhost" or _is_loopback_name(host)):
+            # Another name that resolves to this machine is another site's doing.
+            return web.Response(status=403, text=f"this view is not served as {host}")
+        origin = request.headers.get("Origin")
+        if origin is not None and origin != f"{request.scheme}://{request.host}":
+            return web.Response(status=403, text="pages of other sites may not ask this view")
+        if not self._token:
+            return None
+        given = request.query.get("token") or request.cookies.get(_COOKIE, "")
+        if hmac.compare_digest(given.encode(), self._token.encode()):
+            return None
+        return web.Response(
+            status=401, text="a token is needed: open the address that the view printed"
+        )
+
+    async def _page(self, _request: web.Request) -> web.StreamResponse:
+        response = web.Response(body=_static_bytes("index.html"), content_type="text/html")
+        if self._token:
+            response.set_cookie(_COOKIE, self._token, httponly=True, samesite="Strict")
+        return response
+
+    async def _static(self, request: web.Request) -> web.StreamResponse:
+        name = request.match_info["name"]
+        kind = "text/javascript" if name.endswith(".js") else "text/css"
+        try:
+            return web.Response(body=_static_bytes(name), content_type=kind)
+        except FileNotFoundError:
+            return web.Response(status=404, text=f"there is no {name}")
+
+    async def _scene(self, request: web.Request) -> web.StreamResponse:
+        def work() -> tuple[str, bytes]:
+            showing = self._source.showing()
+            scene = {"title": self._source.title, **showing.scene()}
+            return showing.version, json.dumps(scene, allow_nan=False).encode()
+
+        version, body = await self._in_thread(work)
+        tag = f'"{version}"'
+        if request.headers.get("If-None-Match") == tag:
+            return web.Response(status=304, headers={"ETag": tag})
+        response = web.Response(
+            body=body,
+            content_type="application/json",
+            headers={"ETag": tag, "Cache-Control": "no-cache"},
+        )
+        response.enable_compression()
+        return response
+
+    async def _status(self, _request: web.Request) -> web.StreamResponse:
+        return web.json_response(await self._in_thread(self._source.status))
+
+    async def _events(self, request: web.Request) -> web.StreamResponse:
+        """A line for each change, so that pages need not ask."""
+        response = web.StreamResponse(headers={**_HEADERS, "Cache-Control": "no-store"})
+        response.content_type = "text/event-stream"
+        await response.prepare(request)
+        try:
+            while not self._is_closing:
+                await response.write(b"data: changed\n\n")
+                async with self._changed:
+                    await self._changed.wait()
+        except (ConnectionResetError, asyncio.CancelledError):
+            pass
+        return response
+
+    async def _cell(self, request: web.Request) -> web.StreamResponse:
+        x_m, y_m = float(request.query["x"]), float(request.query["y"])
+        found = await self._in_thread(lambda: self._source.showing().cell(x_m, y_m))
+        return web.json_response(found)
+
+    async def _tile(self, request: web.Request) -> web.StreamResponse:
+        info = request.match_info
+        zoom, col, row = (int(info[name]) for name in ("zoom", "col", "row"))
+        if not _MIN_ZOOM <= zoom <= _MAX_ZOOM:
+            raise InvalidInputError(f"zoom is {zoom}, expected {_MIN_ZOOM} to {_MAX_ZOOM}")
+        moment = None if info["moment"] == "all" else int(info["moment"])
+
+        def work() -> bytes | None:
+            return tile_png(self._source.showing().layers(moment), zoom, col, row)
+
+        body = await self._in_thread(work)
+        # The address names the version, so what it holds never changes.
+        headers = {"Cache-Control": "private, max-age=3600, immutable"}
+        if body is None:
+            return web.Response(status=204, headers=headers)
+        return web.Response(body=body, content_type="image/png", headers=headers)
+
+    async def _pair(self, request: web.Request) -> web.StreamResponse:
+        number, rival = _pair_of(request)
+        pair = await self._in_thread(lambda: self._pair_at(number, rival))
+        spec = pair.spec
+        return web.json_response(
+            {
+                "rows": spec.num_rows,
+                "cols": spec.num_cols,
+                "resolution_m": spec.resolution_m,
+                "layers": PAIR_LAYERS,
+            }
+        )
+
+    async def _pair_picture(self, request: web.Request) -> web.StreamResponse:
+        number, rival = _pair_of(request)
+        layer = request.match_info["layer"]
+        if layer not in PAIR_LAYERS:
+            raise InvalidInputError(f"layer is {layer!r}, expected one of {PAIR_LAYERS}")
+        body = await self._in_thread(lambda: self._pair_at(number, rival).picture(layer))
+        return web.Response(body=body, content_type="image/png")
+
+    async def _rivals(self, request: web.Request) -> web.StreamResponse:
+        number, _ = _pair_of(request)
+
+        def work() -> list[dict[str, Any]]:
+            result = self._source.showing().result(number, self._source.register())
+            return [
+                {
+                    "pose": rival.T_target_source.as_array().round(4).tolist(),
+                    "score_share": round(float(rival.score), 4),
+                }
+                for rival in result.rivals
+            ]
+
+        return web.json_response(await self._in_thread(work))
+
+    def _pair_at(self, number: int, rival: int | None) -> Pair:
+        showing = self._source.showing()
+        key = showing.version, number, rival
+        if key not in self._pairs:
+            while len(self._pairs) >= _MAX_PAIRS:
+                del self._pairs[next(iter(self._pairs))]
+            self._pairs[key] = showing.pair(number, rival, self._source.register())
+        return self._pairs[key]
+
+    async def _in_thread(self, work: Callable[[], Any]) -> Any:
+        """One at a time, beside the loop, which goes on answering."""
+        return await asyncio.get_running_loop().run_in_executor(self._pool, work)
+
+
+def _is_loopback_name(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _pair_of(request: web.Request) -> tuple[int, int | None]:
+    rival = request.query.get("rival")
+    return int(request.match_info["number"]), None if rival is None else int(rival)
+
+
+@functools.cache
+def _static_bytes(name: str) -> bytes:
+    """A file of the page; `name` holds no dots but the last, so it stays in the folder."""
+    file = resources.files("uw_dslam_ros2.view") / "static" / name
+    return file.read_bytes()

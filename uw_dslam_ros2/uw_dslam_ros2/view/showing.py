@@ -1,0 +1,320 @@
+"""What is shown at one moment: from a queue's submaps, constraints and answers to the page."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.merging import (
+    Constraint,
+    MapQueue,
+    SubmapRecord,
+    SubmapState,
+)
+from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
+from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
+from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap, SubmapGroup, render_group
+from uw_dslam_ros2.core.registration.result import RegistrationResult
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId, track_name
+from uw_dslam_ros2.view.overview import (
+    constraint_row,
+    outline_of,
+    registration_row,
+    submap_row,
+    vehicle_rows,
+)
+from uw_dslam_ros2.view.pairs import Pair, lay_on
+from uw_dslam_ros2.view.tiles import Layer, bounds_of
+
+__all__ = ["Register", "Showing"]
+
+FloatArray = NDArray[np.float64]
+
+Register = Callable[[OccupancyMap, OccupancyMap, Any], RegistrationResult]
+"""Source, target, prior or None: asks for one registration; used for rivals."""
+
+_GAP_SHARE = 0.08  # of the page's width, between groups that stand side by side
+_MAX_LAYERS = 6
+
+
+class Showing:
+    """One state of a merge; a new state keeps what it can of the one before.
+
+    Parameters
+    ----------
+    records, constraints
+        As `MapQueue` gives them.
+    answers
+        Each answer, and whether it holds in the graph.
+    before
+        The state shown until now.
+    """
+
+    def __init__(
+        self,
+        records: Sequence[SubmapRecord],
+        constraints: Sequence[Constraint],
+        answers: Sequence[tuple[Answer, bool]] = (),
+        before: Showing | None = None,
+    ) -> None:
+        self._records = list(records)
+        self._constraints, self._answers = list(constraints), list(answers)
+        self._stored: dict[SubmapId, StoredSubmap] = dict(before._stored) if before else {}
+        self._outlines: dict[SubmapId, FloatArray] = dict(before._outlines) if before else {}
+        self._drawn: dict[int, GlobalMap] = before._drawn if before else {}
+        self._layers: OrderedDict[int, list[Layer]] = OrderedDict()
+        for record in self._records:
+            submap, key = record.submap, record.submap.submap_id
+            held = self._stored.get(key)
+            if held is None or held.submap is not submap:
+                self._stored[key] = StoredSubmap.of(submap, submap.grid.values.size)
+                self._outlines[key] = outline_of(submap.grid)
+        self._by_time = sorted(
+            (r for r in self._records if r.state is not SubmapState.WITHDRAWN),
+            key=lambda r: (r.submap.stamp_ns, r.submap.submap_id),
+        )
+        self._T_view_group = self._side_by_side()
+        self.version = self._fingerprint()
+
+    @classmethod
+    def of_queue(cls, queue: MapQueue, before: Showing | None = None) -> Showing:
+        """What a queue holds now."""
+        return cls(queue.submaps(), queue.constraints(), queue.answers(), before)
+
+    @property
+    def num_moments(self) -> int:
+        """Places of the time slider: so many submaps can be shown, oldest first."""
+        return len(self._by_time)
+
+    def scene(self) -> dict[str, Any]:
+        """Everything but the maps' cells, as plain values; lengths in metres of the page."""
+        places = {
+            r.submap.submap_id: (
+                r.component,
+                self._T_view_group[r.component] @ r.T_component_submap,
+            )
+            for r in self._records
+            if r.state is not SubmapState.WITHDRAWN
+        }
+        constraints = (constraint_row(c, places) for c in self._constraints)
+        return {
+            "version": self.version,
+            "moments": [
+                {"submap": str(r.submap.submap_id), "stamp_s": r.submap.stamp_ns * 1e-9}
+                for r in self._by_time
+            ],
+            "groups": self._group_rows(),
+            "vehicles": vehicle_rows(self._records, self._T_view_group),
+            "submaps": [
+                submap_row(r, self._outlines[r.submap.submap_id], self._T_view_group[r.component])
+                for r in self._records
+            ],
+            "constraints": [row for row in constraints if row is not None],
+            "registrations": [
+                registration_row(number, answer, is_used, _sides(answer))
+                for number, (answer, is_used) in enumerate(self._answers, start=1)
+            ],
+        }
+
+    def layers(self, moment: int | None = None) -> list[Layer]:
+        """Maps of all groups, made of the first `moment` submaps (None: all)."""
+        count = self.num_moments if moment is None else max(0, min(moment, self.num_moments))
+        if count not in self._layers:
+            self._layers[count] = [
+                Layer(occupancy, self._T_view_group[group])
+                for group, occupancy in self._maps(count)
+            ]
+            while len(self._layers) > _MAX_LAYERS:
+                self._layers.popitem(last=False)
+        self._layers.move_to_end(count)
+        return self._layers[count]
+
+    def cell(self, x_m: float, y_m: float) -> dict[str, Any] | None:
+        """What is known of the cell under a place of the page; None where nothing is."""
+        for group, T_view_group in self._T_view_group.items():
+            place = T_view_group.inverse().apply(np.array([[x_m, y_m]]))
+            seen_by = {}
+            for record in self._records:
+                if record.component != group or record.state is SubmapState.WITHDRAWN:
+                    continue
+                value = _value_at(record, place)
+                if value is not None:
+                    seen_by[str(record.submap.submap_id)] = value
+            if seen_by:
+                votes = [value > 50 for value in seen_by.values()]
+                return {
+                    "group": group,
+                    "x_m": round(float(place[0, 0]), 3),
+                    "y_m": round(float(place[0, 1]), 3),
+                    "percent": seen_by,
+                    "num_occupied": sum(votes),
+                    "num_free": len(votes) - sum(votes),
+                }
+        return None
+
+    def pair(
+        self, number: int, rival: int | None = None, register: Register | None = None
+    ) -> Pair:
+        """Both maps of an answer laid on each other, as the answer or one of its rivals says.
+
+        Raises
+        ------
+        InvalidInputError
+            If there is no such answer, or no pose in it.
+        """
+        answer = self._answer(number)
+        motion = answer.T_target_source
+        if rival is not None and register is not None:
+            others = self.result(number, register).rivals
+            if not 0 <= rival < len(others):
+                raise InvalidInputError(
+                    f"rival is {rival}, registration {number} has {len(others)}"
+                )
+            motion = others[rival].T_target_source
+        if motion is None:
+            raise InvalidInputError(f"registration {number} has no pose: {answer.why}")
+        source, target = self._pair_maps(answer)
+        return lay_on(target, source, motion)
+
+    def result(self, number: int, register: Register) -> RegistrationResult:
+        """Register the pair of an answer once more, for what an answer does not keep: rivals."""
+        answer = self._answer(number)
+        source, target = self._pair_maps(answer)
+        return register(source, target, answer.query.prior)
+
+    def _answer(self, number: int) -> Answer:
+        if not 1 <= number <= len(self._answers):
+            raise InvalidInputError(
+                f"registration is {number}, there are {len(self._answers)}, counted from 1"
+            )
+        return self._answers[number - 1][0]
+
+    def _pair_maps(self, answer: Answer) -> tuple[OccupancyMap, OccupancyMap]:
+        source, target = self._rendered(answer.query.source), self._rendered(answer.query.target)
+        return source, target
+
+    def _rendered(self, group: SubmapGroup) -> OccupancyMap:
+        missing = [str(i) for i in group.ids if i not in self._stored]
+        if missing:
+            raise InvalidInputError(f"the submaps {', '.join(missing)} are not here any more")
+        occupancy = render_group(group, self._stored, LOG_ODDS_MAX)
+        if occupancy is None:
+            raise InvalidInputError("the map of this pair is empty")
+        return occupancy
+
+    def _maps(self, count: int) -> list[tuple[int, OccupancyMap]]:
+        shown: dict[int, dict[SubmapId, SE2]] = {group: {} for group in self._T_view_group}
+        for record in self._by_time[:count]:
+            shown[record.component][record.submap.submap_id] = record.T_component_submap
+        maps = []
+        for group, poses in sorted(shown.items()):
+            drawn = self._drawn.get(group)
+            if drawn is None:
+                spec = self._first(group).submap.grid.spec
+                drawn = GlobalMap(pinned_lattice(spec, spec.resolution_m), LOG_ODDS_MAX)
+                self._drawn[group] = drawn
+            drawn.draw(self._stored, poses)
+            occupancy = drawn.occupancy()
+            if occupancy is not None:
+                maps.append((group, occupancy))
+        return maps
+
+    def _first(self, group: int) -> SubmapRecord:
+        return next(r for r in self._by_time if r.component == group)
+
+    def _side_by_side(self) -> dict[int, SE2]:
+        """Where each group's frame lies on the page: the first as it is, the others beside it."""
+        groups = sorted({record.component for record in self._by_time})
+        boxes = {group: self._box(group) for group in groups}
+        gap = _GAP_SHARE * sum(high_x - low_x for low_x, _, high_x, _ in boxes.values())
+        placed: dict[int, SE2] = {}
+        edge_m = top_m = 0.0
+        for group, (low_x, _, high_x, high_y) in boxes.items():
+            if not placed:
+                placed[group], edge_m, top_m = SE2(), high_x, high_y
+            else:
+                placed[group] = SE2(edge_m + gap - low_x, top_m - high_y)
+                edge_m += gap + high_x - low_x
+        for record in self._records:  # withdrawn ones may be alone in theirs
+            placed.setdefault(record.component, SE2())
+        return placed
+
+    def _box(self, group: int) -> tuple[float, float, float, float]:
+        boxes = np.array(
+            [
+                bounds_of(r.submap.grid.spec, r.T_component_submap)
+                for r in self._by_time
+                if r.component == group
+            ]
+        )
+        low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def _group_rows(self) -> list[dict[str, Any]]:
+        rows = []
+        for group in sorted({record.component for record in self._by_time}):
+            own = [r for r in self._by_time if r.component == group]
+            low_x, low_y, high_x, high_y = self._box(group)
+            shift = self._T_view_group[group]
+            rows.append(
+                {
+                    "group": group,
+                    "frame": "map" if group == 0 else f"group {group}",
+                    "vehicles": sorted({track_name(r.submap.submap_id.track) for r in own}),
+                    "num_submaps": len(own),
+                    "shift": [shift.x, shift.y],
+                    "bounds": [
+                        low_x + shift.x,
+                        low_y + shift.y,
+                        high_x + shift.x,
+                        high_y + shift.y,
+                    ],
+                }
+            )
+        return rows
+
+    def _fingerprint(self) -> str:
+        hasher = hashlib.blake2b(digest_size=8)
+        for record in self._records:
+            key = record.submap.submap_id
+            row = (str(key), record.state, record.component, record.T_component_submap)
+            hasher.update(repr(row).encode() + self._stored[key].digest)
+        for constraint in self._constraints:
+            hasher.update(
+                repr((constraint.source, constraint.target, constraint.is_inlier)).encode()
+            )
+        hasher.update(repr([answer.query.key for answer, _ in self._answers]).encode())
+        return hasher.hexdigest()
+
+
+def _value_at(record: SubmapRecord, place: FloatArray) -> int | None:
+    grid = record.submap.grid
+    cells = grid.spec.cells_of(record.T_component_submap.inverse().apply(place))
+    if not grid.spec.contains(cells)[0]:
+        return None
+    value = int(grid.values[cells[0, 0], cells[0, 1]])
+    return value if value >= 0 else None
+
+
+def _sides(answer: Answer) -> dict[str, str]:
+    return {
+        "source": _name_of(answer.query.source),
+        "target": _name_of(answer.query.target),
+    }
+
+
+def _name_of(group: SubmapGroup) -> str:
+    """The vehicles of a group, and how many submaps."""
+    names = sorted({track_name(i.track) for i in group.ids})
+    if len(group.ids) == 1:
+        return str(group.ids[0])
+    return f"{' + '.join(names)} ({len(group.ids)} submaps)"

@@ -1,0 +1,88 @@
+import { ask, clock, listen } from "./api.js";
+import { MapView } from "./map.js";
+import { PairDialog } from "./pair.js";
+import { Panel } from "./panel.js";
+
+const at = (id) => document.getElementById(id);
+let scene = null;
+let isBusy = false;
+let isStale = false;
+
+const dialog = new PairDialog();
+const panel = new Panel(at("tabs"), at("content"), {
+  toggle: (name, isOn) => map.toggle(name, isOn),
+  zoom: (name) => {
+    const points = scene.vehicles.find((v) => v.name === name).track.flatMap((piece) => piece.xy);
+    const xs = points.map((p) => p[0]);
+    const ys = points.map((p) => p[1]);
+    if (points.length) map.fit([[Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)]]);
+  },
+  pair: (row) => {
+    map.highlight(scene.constraints.filter((edge) => belongs(edge, row)).map((edge) => edge.line));
+    dialog.open(row);
+  },
+});
+const map = new MapView("map", select, async (x, y) => panel.showCell(await map.cell(x, y)));
+
+function belongs(edge, row) {
+  return edge.kind === "registration" && row.submaps.includes(edge.source) && row.submaps.includes(edge.target);
+}
+
+function select(kind, which) {
+  if (kind === "submap") {
+    panel.showSubmap(which);
+    return;
+  }
+  const edge = scene.constraints[which];
+  map.highlight([edge.line]);
+  // Of the answers about these two submaps, the one that holds and is of the fewest others.
+  const rows = scene.registrations.filter((row) => belongs(edge, row));
+  rows.sort((a, b) => Number(b.is_used) - Number(a.is_used) || a.submaps.length - b.submaps.length);
+  if (rows.length) dialog.open(rows[0]);
+  else panel.open("matches");
+}
+
+function draw() {
+  const slider = at("moment");
+  const moment = Number(slider.value);
+  const newest = moment > 0 ? scene.moments[moment - 1] : null;
+  at("moment-text").textContent = newest ? `${clock(newest.stamp_s)}  ${moment} of ${scene.moments.length} submaps` : "before the first submap";
+  map.show(scene, moment);
+}
+
+async function refresh() {
+  if (isBusy) {
+    isStale = true;
+    return;
+  }
+  isBusy = true;
+  try {
+    const slider = at("moment");
+    const wasNewest = slider.value === slider.max;
+    const [next, status] = await Promise.all([ask("/api/scene"), ask("/api/status")]);
+    scene = next;
+    panel.status = status;
+    slider.max = String(scene.moments.length);
+    if (wasNewest) slider.value = slider.max;
+    at("title").textContent = scene.title;
+    document.title = `${scene.title} – uw_dslam`;
+    const merged = scene.vehicles.filter((vehicle) => vehicle.num_merged > 0).length;
+    at("summary").textContent = `${merged} of ${scene.vehicles.length} vehicles merged, ${scene.submaps.length} submaps, ${scene.groups.length} ${scene.groups.length === 1 ? "group" : "groups that are not joined"}`;
+    at("connection").textContent = "";
+    panel.show(scene);
+    draw();
+  } catch (error) {
+    at("connection").textContent = error.message;
+  } finally {
+    isBusy = false;
+    if (isStale) {
+      isStale = false;
+      refresh();
+    }
+  }
+}
+
+at("moment").oninput = () => scene && draw();
+listen(refresh, (isThere) => {
+  at("connection").textContent = isThere ? "" : "the view is not there: what is shown may be old";
+});
