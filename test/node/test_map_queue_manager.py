@@ -1,6 +1,7 @@
 """The manager with real registration servers: merging, services, TF, failures."""
 
 import contextlib
+import dataclasses
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from uw_dslam_msgs.srv import (
 )
 from visualization_msgs.msg import MarkerArray
 
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.provenance import read_provenance
@@ -36,6 +38,7 @@ from uw_dslam_ros2.io.session import SessionInUseError, has_session, load_sessio
 from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, submap_to_msg
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
+from uw_dslam_ros2.ros.plumbing import missing_submaps
 from uw_dslam_ros2.ros.plumbing.qos import LATCHED, SUBMAPS
 
 pytestmark = pytest.mark.ros
@@ -83,10 +86,11 @@ def manage(ros_context, spinning):
     """``with manage(settings) as (until, probe, call)``: a manager, a server, a probe."""
 
     @contextlib.contextmanager
-    def run(*, has_server=True, **settings):
+    def run(*others, has_server=True, **settings):
         parameters = [Parameter(k.replace("__", "."), value=v) for k, v in settings.items()]
         probe = Probe(ros_context)
-        nodes = [MapQueueManager(context=ros_context, parameter_overrides=parameters), probe.node]
+        manager = MapQueueManager(context=ros_context, parameter_overrides=parameters)
+        nodes = [manager, probe.node, *others]
         if has_server:
             nodes.append(RegistrationServer(context=ros_context))
 
@@ -336,6 +340,59 @@ def test_a_disk_that_is_away_stops_nothing_and_is_used_when_back(manage, tmp_pat
         saved = call(SaveSession, "save_session", path=str(disk / "session"))
         assert saved.result == SaveSession.Response.DONE, saved.message
     assert len(load_session(disk / "session").submaps()) == 2
+
+
+def many_submaps(count):
+    spec, values = GridSpec(0.5, 8, 8), np.zeros((8, 8), np.int8)
+    values[2:6, 2] = 100
+    first = room_submap("auv_1")
+    return [
+        dataclasses.replace(
+            first,
+            sequence=number,
+            grid=OccupancyMap(spec, values),
+            T_odom_submap=SE2(2.0 * number, 0.0, 0.0),
+            trajectory=np.empty((0, 3)),
+            trajectory_stamp_ns=np.empty(0, np.int64),
+        )
+        for number in range(count)
+    ]
+
+
+def test_a_manager_that_starts_late_asks_for_what_it_missed(manage, ros_context):
+    submaps = many_submaps(130)
+    mapper = rclpy.create_node("sonar_mapper", namespace="auv_1", context=ros_context)
+    publisher = mapper.create_publisher(SubmapMsg, "submap", SUBMAPS)
+    asked = []
+
+    def give(request, response):
+        asked.append(request.sequence)
+        response.result = response.DONE
+        response.submap = submap_to_msg(submaps[request.sequence])
+        return response
+
+    mapper.create_service(GetSubmap, "~/get_submap", give)
+    for submap in submaps:
+        publisher.publish(submap_to_msg(submap))
+    with manage(mapper, has_server=False, **FAST) as (until, probe, _):
+        until(lambda: len(probe.states()) == len(submaps), "all submaps")
+    assert len(set(asked)) == len(asked) >= len(submaps) - SUBMAPS.depth
+
+
+def test_what_is_missing_and_cannot_be_had_is_told(manage, monkeypatch):
+    monkeypatch.setattr(missing_submaps, "_LOST_S", 3.0)
+    statuses = []
+
+    def on_diagnostics(msg):
+        statuses.extend(s for s in msg.status if s.name.startswith("map_queue_manager"))
+
+    with manage(**FAST) as (until, probe, _):
+        probe.node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
+        for number in (0, 4, 6):
+            probe.send(many_submaps(7)[number])
+        until(lambda: any("auv_1: 1 to 3, 5" in s.message for s in statuses), "the report")
+    assert statuses[-1].level == DiagnosticStatus.WARN
+    assert {v.key: v.value for v in statuses[-1].values}["num_submaps_missing"] == "4"
 
 
 def test_two_managers_do_not_share_a_session(manage, ros_context, tmp_path):

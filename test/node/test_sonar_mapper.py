@@ -17,6 +17,7 @@ from sensor_msgs.msg import Imu, LaserScan
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 from uw_dslam_msgs.msg import Submap as SubmapMsg
+from uw_dslam_msgs.srv import GetSubmap
 
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.messages import stamp_of
@@ -160,6 +161,17 @@ def test_room_becomes_map_submap_odometry_and_frames(ros_context, spinning):
         until(lambda: ("auv_1/odom", "auv_1/base_link") in vehicle.frames, "TF")
         last_ns = START_NS + 9_900_000_000
         until(lambda: stamp_of(vehicle.odometry[-1]) == last_ns, "the last odometry")
+        client = vehicle.node.create_client(GetSubmap, "sonar_mapper/get_submap")
+        until(client.service_is_ready, "the service")
+        futures = [
+            client.call_async(GetSubmap.Request(vehicle_id="auv_1", sequence=number))
+            for number in (0, 1)
+        ]
+        until(lambda: all(future.done() for future in futures), "answers")
+    again, unknown = (future.result() for future in futures)
+    assert (again.result, again.submap) == (GetSubmap.Response.DONE, vehicle.submaps[-1])
+    assert unknown.result == GetSubmap.Response.NOT_FOUND
+    assert "no submap 1" in unknown.message
     submap = submap_from_msg(vehicle.submaps[-1])
     assert (submap.vehicle_id, submap.sequence) == ("auv_1", 0)
     assert submap.run_id > 0

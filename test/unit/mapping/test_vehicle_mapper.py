@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.mapping import (
     VehicleMapper,
     VehicleMapperConfig,
 )
+from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.navigation import NavigationConfig
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import SonarConfig
@@ -131,6 +132,17 @@ def test_submaps_count_up_and_revise_only_themselves(mapped):
         grids = [s.grid.values.tobytes() for s in submaps if s.sequence == sequence]
         assert len(set(grids)) == 1  # rigid: only the pose is revised
     assert mapper.diagnostics()["num_submaps"] == max(sequences) + 1
+
+
+def test_a_submap_is_given_again_as_it_was_given_last(mapped):
+    mapper, submaps = mapped
+    newest = {s.sequence: s for s in submaps}
+    assert any(submap.revision > 1 for submap in newest.values())
+    for sequence, submap in newest.items():
+        again = StoredSubmap.of(mapper.issued(sequence), 10**9)
+        assert again.fingerprint == StoredSubmap.of(submap, 10**9).fingerprint
+        assert (again.submap.run_id, again.submap.revision) == (submap.run_id, submap.revision)
+    assert mapper.issued(max(newest) + 1) is None
 
 
 def test_every_ping_is_in_exactly_one_submap(recording, mapped):

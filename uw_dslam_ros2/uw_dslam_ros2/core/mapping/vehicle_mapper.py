@@ -200,6 +200,13 @@ class VehicleMapper:
         last_ns = int(self._open.stamps_ns[-1])
         return issued + self._close(self._navigation.relative_at(last_ns)[1])
 
+    def issued(self, sequence: int) -> Submap | None:
+        """A submap as it was given away last; None if there is none of this number."""
+        for section in self._closed:
+            if section.sequence == sequence:
+                return self._submap_of(section, section.T_odom_issued)
+        return None
+
     # --- results
     # ----------------
 
@@ -461,12 +468,9 @@ class VehicleMapper:
                     continue
                 section.revision += 1
             section.T_odom_issued = T_odom_submap
-            issued.append(
-                section.to_submap(
-                    self._vehicle_id,
-                    self._run_id,
-                    T_odom_submap,
-                    self._config.occupancy.log_odds_max,
-                )
-            )
+            issued.append(self._submap_of(section, T_odom_submap))
         return issued
+
+    def _submap_of(self, section: ClosedSection, T_odom_submap: SE2) -> Submap:
+        log_odds_max = self._config.occupancy.log_odds_max
+        return section.to_submap(self._vehicle_id, self._run_id, T_odom_submap, log_odds_max)

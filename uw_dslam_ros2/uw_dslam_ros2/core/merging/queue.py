@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 
@@ -176,6 +177,22 @@ class MapQueue:
         """All submaps, by vehicle, run and sequence."""
         answers = list(self._answers.values())
         return records_of(self._submaps, self._withdrawn, self._plan(), self._anchor, answers)
+
+    def missing(self, max_per_track: int = 100) -> dict[Track, list[int]]:
+        """Sequence numbers of each run that never came, though later ones did; the first few."""
+        held: dict[Track, list[int]] = {}
+        for submap_id in sorted(self._submaps):
+            held.setdefault(submap_id.track, []).append(submap_id.sequence)
+        found: dict[Track, list[int]] = {}
+        for track, sequences in held.items():
+            gaps = (
+                number
+                for before, after in itertools.pairwise([-1, *sequences])
+                for number in range(before + 1, after)
+            )
+            if first := list(itertools.islice(gaps, max_per_track)):
+                found[track] = first
+        return found
 
     def answers(self) -> list[tuple[Answer, bool]]:
         """All answers, by target and source, and whether each holds in the pose graph."""

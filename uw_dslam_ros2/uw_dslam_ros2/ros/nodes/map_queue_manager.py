@@ -47,6 +47,7 @@ from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
 from uw_dslam_ros2.ros.plumbing.idle_timeout import IdleTimeout
 from uw_dslam_ros2.ros.plumbing.map_publisher import MapPublisher
+from uw_dslam_ros2.ros.plumbing.missing_submaps import MissingSubmaps
 from uw_dslam_ros2.ros.plumbing.node_settings import MapQueueManagerConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import LATCHED, SUBMAPS
@@ -106,6 +107,7 @@ class MapQueueManager(Node):
             self._config.request_timeout_s,
             self._worker.post,
         )
+        self._missing = MissingSubmaps(self, self._worker.post, self._on_submap)
         for vehicle_id in self._config.vehicles:
             self._subscribe(f"/{vehicle_id.strip('/')}/submap")
         QueueServices(self, self, self._worker, self._group)
@@ -171,6 +173,7 @@ class MapQueueManager(Node):
         except InvalidInputError as error:
             self.complain(f"submap refused on {topic}: {error}")
             return
+        self._missing.note(topic, submap)
         if not is_new:
             self._counts["num_repeated"] += 1
             return
@@ -189,6 +192,7 @@ class MapQueueManager(Node):
         if now_s - self._discovered_s >= _DISCOVERY_PERIOD_S:
             self._discovered_s = now_s
             self._discover()
+            self._missing.look(self._queue.missing())
         for request_id, reason in self._servers.take_lost():
             self._ask_again(request_id, reason)
         self._queue.is_growing = self._idle.is_active(now_s)
@@ -377,11 +381,14 @@ class MapQueueManager(Node):
     def _report(self) -> Report:
         values = {**self._values, **dict(sorted(self._counts.items()))}
         values["num_jobs_waiting"] = self._worker.num_waiting
+        values |= self._missing.values()
         if trouble := self._keeper.trouble:
             return "error", trouble, values
         num_servers = self._values.get("num_servers", 0)
         if not num_servers:
             return "warning", "no registration server on the graph", values
+        if lost := self._missing.lost:
+            return "warning", lost, values
         return "info", self._message, values
 
 

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 from uw_dslam_msgs.msg import Submap as SubmapMsg
+from uw_dslam_msgs.srv import GetSubmap
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
@@ -47,7 +48,7 @@ from uw_dslam_ros2.ros.plumbing.frames import (
 )
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
-from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SUBMAPS, sensor_qos
+from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SERVICES, SUBMAPS, sensor_qos
 from uw_dslam_ros2.ros.plumbing.running import run_node
 from uw_dslam_ros2.ros.plumbing.sensor_inputs import SensorInput, default_inputs, found_inputs
 from uw_dslam_ros2.ros.plumbing.stamp_order import StampOrder
@@ -106,6 +107,13 @@ class SonarMapper(Node):
             self._subscribe(sensor)
         self.create_service(
             Trigger, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup()
+        )
+        self.create_service(
+            GetSubmap,
+            "~/get_submap",
+            self._on_get_submap,
+            qos_profile=SERVICES,
+            callback_group=ReentrantCallbackGroup(),
         )
         self._diagnostics = Diagnostics(self, self._report, self._vehicle_id)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -387,6 +395,28 @@ class SonarMapper(Node):
             response.message = f"{type(error).__name__}: {error}"
         self.get_logger().info(f"finish: {response.message}")
         return response
+
+    def _on_get_submap(
+        self, request: GetSubmap.Request, response: GetSubmap.Response
+    ) -> GetSubmap.Response:
+        """Give a submap again, to whoever did not get it."""
+        try:
+            found = self._worker.call(lambda: self._issued(request)).result(_FINISH_TIMEOUT_S)
+        except Exception as error:  # noqa: BLE001 (the caller gets it)
+            found, response.message = None, f"{type(error).__name__}: {error}"
+        response.result = response.NOT_FOUND
+        if found is not None:
+            response.result, response.submap = response.DONE, submap_to_msg(found)
+        elif not response.message:
+            response.message = f"this run of {self._vehicle_id} has no submap {request.sequence}"
+        return response
+
+    def _issued(self, request: GetSubmap.Request) -> Submap | None:
+        found = self._mapper.issued(int(request.sequence))
+        is_wanted = found is not None and (
+            request.vehicle_id == found.vehicle_id and request.run_id in (0, found.run_id)
+        )
+        return found if is_wanted else None
 
     def _report(self) -> Report:
         for sensor in list(self._inputs.values()):
