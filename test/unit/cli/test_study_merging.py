@@ -8,7 +8,7 @@ from uw_dslam_ros2.cli.studies import merging
 from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission
 from uw_dslam_ros2.core.merging import MatchRequest
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, lawnmower_fleet, view_from
+from uw_dslam_ros2.sim.fleets import KnowingMatcher, known_overlap, lawnmower_fleet, view_from
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +48,21 @@ def test_a_vehicle_in_a_wrong_place_counts(mission):
     assert row["ssim"] < good["ssim"]
     assert row["mse"] > good["mse"]
     assert row["iou"] < good["iou"]
+
+
+def test_who_stayed_apart_is_named_with_what_was_in_common(mission, fleet):
+    placing = merging._true_placing(mission)
+    assert merging._row(mission, "all", placing, 0, 0.0)["apart"] == ""
+    without = {submap_id: T for submap_id, T in placing.items() if submap_id[0] != "auv_02"}
+    told = merging._row(mission, "two", without, 0, 0.0)["apart"]
+    name, share = told.removesuffix(" in common").split()
+    assert name == "auv_02"
+    shares = [
+        known_overlap(fleet.submaps[a].grid, fleet.submaps[b].grid,
+                      placing[b].inverse() @ placing[a])
+        for a in placing if a[0] == "auv_02" for b in without
+    ]  # fmt: skip
+    assert share == f"{max(shares):.0%}"
 
 
 def test_methods_share_the_queue_and_differ_in_what_answers(mission, fleet):

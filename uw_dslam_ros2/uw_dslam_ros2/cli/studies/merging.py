@@ -1,16 +1,19 @@
 """Three vehicles into one map: the queue against the paper's, with the engine, ICP and NDT.
 
 Simulated missions by seed, each vehicle with an unknown start; their submaps are made once and
-given to every method. "true poses" places each submap where it really was: no merging can
-expect better. The pairwise queue is the paper's: two maps are taken, registered, and the merged
-one is put back. ICP and NDT are started from many headings and have no verdict, so the queue
-believes them. Errors are those of the largest group of vehicles that was joined, in one common
-frame. With ``--data`` (or UW_DATA_DIR) the Aracati recording is merged too, as three vehicles.
+given to every method. "true poses" places each submap where it really was: no merging can expect
+better. Of a vehicle that stayed apart the study tells the greatest share that any of its submaps
+has, by the truth, in common with one that was joined. The pairwise queue is the paper's: two maps
+are taken, registered, and the merged one is put back. ICP and NDT are started from many headings
+and have no verdict, so the queue believes them. Errors are those of the largest group of vehicles
+that was joined, in one common frame. With ``--data`` (or UW_DATA_DIR) the Aracati recording is
+merged too, as three vehicles.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -58,7 +61,7 @@ from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
-from uw_dslam_ros2.sim.fleets import answer_all, make_result
+from uw_dslam_ros2.sim.fleets import answer_all, known_overlap, make_result
 from uw_dslam_ros2.sim.places import PLACES
 
 __all__ = ["add_arguments", "run"]
@@ -125,7 +128,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _short(row: dict[str, Any]) -> str:
-    return f"{row['method']} {row['rmse_m']:.2f} m ({row['vehicles']} of {row['of']})"
+    text = f"{row['method']} {row['rmse_m']:.2f} m ({row['vehicles']} of {row['of']}"
+    return f"{text}; apart: {row['apart']})" if row["apart"] else f"{text})"
 
 
 def _missions(args: argparse.Namespace) -> Iterator[FleetMission]:
@@ -241,6 +245,7 @@ def _row(
         "ssim": "",
         "iou": "",
         "wall_share": round(map_sharpness(fused).wall_share, 5),
+        "apart": _apart(mission, placing),
         "registrations": num_searches,
         "cpu_s": round(cpu_s, 1),
     }
@@ -254,6 +259,20 @@ def _row(
             "iou": round(scores.wall_iou_tolerant, 4),
         }
     return row
+
+
+def _apart(mission: FleetMission, placing: Placing) -> str:
+    """Who is not in a group, and the greatest share truly in common with who is."""
+    truth = _true_placing(mission)
+    grids = {s.submap_id: s.grid for s in mission.submaps if s.submap_id in truth}
+    joined = {submap_id[0] for submap_id in placing}
+    shares: dict[str, float] = {}
+    for one, other in itertools.product(grids, grids):
+        if one[0] not in joined and other in placing:
+            motion = truth[other].inverse() @ truth[one]
+            share = known_overlap(grids[one], grids[other], motion)
+            shares[one[0]] = max(share, shares.get(one[0], 0.0))
+    return ", ".join(f"{name} {share:.0%} in common" for name, share in sorted(shares.items()))
 
 
 def _trajectories(submaps: list[Submap], placing: Placing) -> Mapping[str, Trajectory]:
