@@ -91,14 +91,17 @@ class Vehicle:
         msg.header.stamp = stamp_to_msg(stamp_ns)
         return msg
 
+    def send_yaw(self, stamp_ns):
+        imu = Imu()
+        imu.header.stamp = stamp_to_msg(stamp_ns)
+        imu.orientation_covariance[8] = 1e-4
+        self.imu_pub.publish(imu)
+
     def send_second(self, second):
         """Messages of one second: ten of navigation, two scans."""
         for tenth in range(10):
             stamp_ns = START_NS + second * 1_000_000_000 + tenth * 100_000_000
-            imu = Imu()
-            imu.header.stamp = stamp_to_msg(stamp_ns)
-            imu.orientation_covariance[8] = 1e-4
-            self.imu_pub.publish(imu)
+            self.send_yaw(stamp_ns)
             twist = TwistWithCovarianceStamped()
             twist.header.stamp = stamp_to_msg(stamp_ns)
             twist.twist.twist.linear.x = SPEED_M_S
@@ -246,19 +249,36 @@ def test_unknown_frame_is_named(ros_context, spinning):
         until(lambda: "where auv_1/sonar is on auv_1/base_link" in vehicle.message(), "the name")
 
 
-def test_recording_that_begins_again_begins_a_new_map(ros_context, spinning):
+def test_recording_that_begins_again_begins_a_new_run_and_keeps_the_old_one(ros_context, spinning):
     vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
     with spinning(mapper, vehicle.node) as until:
         until(vehicle.is_connected, "connection")
         vehicle.send_mount()
         drive(until, vehicle, range(4))
         until(lambda: vehicle.values().get("num_scan") == "8", "the first round")
-        drive(until, vehicle, range(2))
-        until(lambda: vehicle.values().get("num_scan") == "12", "the second round")
+        drive(until, vehicle, range(3))
         until(lambda: int(vehicle.values().get("num_restarts", "0")) >= 1, "the restart")
         response = finish(until, vehicle)
-    assert response.success
-    assert vehicle.odometry[-1].pose.pose.position.x < 3 * SPEED_M_S
+        until(lambda: len(vehicle.submaps) == 2, "a submap of each run")
+    assert "14 pings mapped" in response.message
+    first, second = (submap_from_msg(msg) for msg in vehicle.submaps)
+    assert first.run_id != second.run_id
+    assert (len(first.trajectory), len(second.trajectory)) == (8, 6)
+    assert vehicle.odometry[-1].pose.pose.position.x < 4 * SPEED_M_S
+
+
+def test_one_late_message_changes_nothing(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        drive(until, vehicle, range(4))
+        vehicle.send_yaw(START_NS + 500_000_000)
+        drive(until, vehicle, range(4, 6))
+        until(lambda: vehicle.values().get("num_scan") == "12", "all scans")
+        response = finish(until, vehicle)
+    assert "12 pings mapped into 1 submaps" in response.message
+    assert vehicle.values().get("num_restarts", "0") == "0"
 
 
 def test_sensors_with_other_names_are_found_by_their_types(ros_context, spinning):

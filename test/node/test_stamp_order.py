@@ -27,7 +27,7 @@ def test_streams_in_order_become_one_stream_in_order(seed):
     queues = {"imu": 100, "dvl": 30, "sonar": 10}
     queues = {name: sorted(rng.choice(10_000, n, False).tolist()) for name, n in queues.items()}
     every_stamp = sorted(stamp for queue in queues.values() for stamp in queue)
-    order = StampOrder(hold_ns=FOREVER, jump_ns=FOREVER)
+    order = StampOrder(hold_ns=FOREVER, back_ns=FOREVER)
     for name, queue in queues.items():
         order.advance(name, queue[0])  # all have been heard of
     got = []
@@ -42,7 +42,7 @@ def test_streams_in_order_become_one_stream_in_order(seed):
 
 
 def test_item_waits_for_the_slowest_stream():
-    order = StampOrder(hold_ns=FOREVER, jump_ns=FOREVER)
+    order = StampOrder(hold_ns=FOREVER, back_ns=FOREVER)
     order.add("imu", 5, "imu 5")
     order.advance("dvl", 3)
     order.add("imu", 10, "imu 10")
@@ -52,7 +52,7 @@ def test_item_waits_for_the_slowest_stream():
 
 
 def test_dead_stream_is_not_waited_for():
-    order = StampOrder(hold_ns=100, jump_ns=FOREVER)
+    order = StampOrder(hold_ns=100, back_ns=FOREVER)
     order.advance("dvl", 10)
     order.add("imu", 100, "a")
     assert drained(order) == []
@@ -62,7 +62,7 @@ def test_dead_stream_is_not_waited_for():
 
 @pytest.mark.parametrize("names", [("dvl", "imu", "sonar"), ("sonar", "imu", "dvl")])
 def test_equal_stamps_leave_by_the_name_of_their_stream(names):
-    order = StampOrder(hold_ns=0, jump_ns=FOREVER)
+    order = StampOrder(hold_ns=0, back_ns=FOREVER)
     for name in names:
         order.add(name, 5, name)
     order.add("dvl", 5, "dvl again")
@@ -70,7 +70,7 @@ def test_equal_stamps_leave_by_the_name_of_their_stream(names):
 
 
 def test_late_item_is_counted_and_leaves_at_once():
-    order = StampOrder(hold_ns=0, jump_ns=FOREVER)
+    order = StampOrder(hold_ns=0, back_ns=FOREVER)
     order.add("imu", 200, "a")
     assert drained(order) == ["a"]
     order.add("dvl", 50, "late")
@@ -78,23 +78,90 @@ def test_late_item_is_counted_and_leaves_at_once():
     assert drained(order) == ["late"]
 
 
-def test_jump_back_is_judged_for_each_stream():
-    order = StampOrder(hold_ns=10, jump_ns=100)
-    order.add("imu", 1000, "a")
-    assert not order.has_jumped_back("dvl", 10)
-    assert not order.has_jumped_back("imu", 900)
-    assert order.has_jumped_back("imu", 899)
-    order.clear()
-    assert not order.has_jumped_back("imu", 899)
+def jumping():
+    """Two streams that have come to 1000; a jump is believed after 30."""
+    order = StampOrder(hold_ns=100, back_ns=100, ahead_ns=200, believe_ns=30)
+    for name in ("imu", "dvl"):
+        assert not order.offer(name, 1000, f"{name} 1000")
+    drained(order)
+    return order
+
+
+@pytest.mark.parametrize("stamp", [899, 1201])
+def test_a_single_stamp_far_away_is_late_and_changes_nothing(stamp):
+    order = jumping()
+    assert not order.offer("imu", stamp, "wrong")
+    assert drained(order) == []
+    assert not order.offer("imu", 1010, "right")
+    assert not order.offer("dvl", 1010, "also")
+    assert drained(order) == ["also", "right"]
+    assert order.num_late == 1
+
+
+@pytest.mark.parametrize("stamp", [900, 1200])
+def test_a_stamp_that_is_not_far_away_is_taken_as_it_is(stamp):
+    order = jumping()
+    assert not order.offer("imu", stamp, "near")
+    assert order.displaced == {}
+
+
+@pytest.mark.parametrize("start", [500, 5000])
+def test_a_clock_that_all_follow_was_set(start):
+    order = jumping()
+    order.offer("imu", 1010, "old")
+    assert not order.offer("imu", start, "a")
+    assert not order.offer("dvl", start + 5, "b")
+    assert not order.offer("imu", start + 29, "c")
+    assert order.offer("imu", start + 30, "d")
+    assert list(order.rest()) == ["old"]
+    order.begin_anew()
+    assert drained(order) == ["a", "b"]  # as far as the other one has come
+    assert not order.offer("dvl", start + 31, "e")
+    assert drained(order) == ["c", "d"]
+    assert order.num_late == 0
+
+
+def test_after_a_jump_those_are_waited_for_that_have_not_followed_yet():
+    order = jumping()
+    order.offer("imu", 500, "a")
+    assert order.offer("imu", 530, "b")
+    order.begin_anew()
+    assert drained(order) == []
+    order.offer("dvl", 505, "c")
+    assert drained(order) == ["a", "c"]
+
+
+def test_a_jump_that_one_sensor_makes_alone_is_none():
+    """Its messages are left out, and it is told whose they are."""
+    order = jumping()
+    for i in range(40):
+        assert not order.offer("imu", 500 + 10 * i, "wrong")
+        assert not order.offer("dvl", 1010 + 10 * i, f"dvl {i}")
+    assert order.displaced == {"imu": 40}
+
+
+def test_late_messages_of_a_burst_are_no_jump():
+    order = jumping()
+    for i in range(20):
+        assert not order.offer("imu", 700 + i, "late")
+    assert not order.offer("imu", 1020, "in time")
+    assert order.num_late == 20
+
+
+def test_a_first_message_is_never_displaced():
+    order = StampOrder(hold_ns=10, back_ns=100, ahead_ns=200)
+    order.expect("dvl", 1000)
+    assert not order.offer("imu", 50_000, "a")
+    assert not order.offer("dvl", 10, "b")
+    assert order.displaced == {}
 
 
 def test_expected_stream_is_waited_for_from_the_start_on():
-    order = StampOrder(hold_ns=100, jump_ns=50)
+    order = StampOrder(hold_ns=100, back_ns=50)
     order.expect("dvl", 1000)
     order.add("imu", 1000, "a")
     order.add("imu", 1099, "b")
     assert drained(order) == ["a"]
-    assert not order.has_jumped_back("dvl", 900)  # its first, however early
     order.add("dvl", 1050, "c")
     assert drained(order) == ["c"]
     order.expect("imu", 5000)  # heard of already: nothing changes
@@ -103,7 +170,7 @@ def test_expected_stream_is_waited_for_from_the_start_on():
 
 
 def test_expected_stream_that_never_comes_is_given_up():
-    order = StampOrder(hold_ns=100, jump_ns=50)
+    order = StampOrder(hold_ns=100, back_ns=50)
     order.expect("dvl", 1000)
     order.add("imu", 1000, "a")
     order.add("imu", 1101, "b")

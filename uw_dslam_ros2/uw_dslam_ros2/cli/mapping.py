@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import multiprocessing
 from collections.abc import Callable, Iterable, Sequence
@@ -19,16 +20,16 @@ from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.health import MappedVehicle, SensorCount, health_findings
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.vehicle_mapper import VehicleMapper
+from uw_dslam_ros2.core.mapping.runs import RunBreak, VehicleRuns
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import RegistrationResult
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.bags import ImuEvent, TransformEvent, TruthEvent
 from uw_dslam_ros2.io.conventions import correct_mounting
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.examining import examine_recording, mended
-from uw_dslam_ros2.io.feeding import Mountings, feed, in_stamp_order, role_of
+from uw_dslam_ros2.io.feeding import Mountings, feed_runs, in_stamp_order, role_of
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.topics import base_frame_of
@@ -166,8 +167,9 @@ def map_recording(
         present = {role: SensorCount(1) for role in recording.topics}
         found = health_findings(MappedVehicle(recording.vehicle_id, present, {}))
         return VehicleSubmaps(recording.vehicle_id, (), {}, tuple(found))
-    mapper = VehicleMapper(config, recording.vehicle_id)
-    newest: dict[int, Submap] = {}
+    run_ids = itertools.count(1)
+    runs = VehicleRuns(config, recording.vehicle_id, lambda: next(run_ids))
+    newest: dict[SubmapId, Submap] = {}
     number = 0
     has_yaw = has_yaw_rate = False
     first_ns: int | None = None
@@ -191,13 +193,15 @@ def map_recording(
                 has_yaw_rate |= event.yaw_rate_rad_s is not None
             try:
                 mounting = correct_mounting(event, mountings.of(event), reader.conventions)
-                submaps = feed(mapper, event, mounting)
+                submaps = feed_runs(runs, event, mounting)
             except InvalidInputError as error:
                 raise DataError(f"{recording.vehicle_id}: {role_of(event)}: {error}") from error
-            newest |= {submap.sequence: submap for submap in submaps}
-        newest |= {submap.sequence: submap for submap in mapper.finish()}
+            newest |= {submap.submap_id: submap for submap in submaps}
+        newest |= {submap.submap_id: submap for submap in runs.finish()}
     _count(number % 200)
-    stamps_ns, poses = mapper.trajectory()
+    findings += [_new_run(reason) for reason in runs.breaks]
+    diagnostics = runs.diagnostics()
+    stamps_ns, poses = runs.trajectory()
     sensor_stamps = {r: stamps[stamps > 0] for r, stamps in reader.stamps.items()}
     sensor_stamps = {role: stamps for role, stamps in sensor_stamps.items() if len(stamps)}
     vehicle = MappedVehicle(
@@ -209,7 +213,7 @@ def map_recording(
             for role, count in reader.counts.items()
             if count.num and role != "truth"
         },
-        mapper.diagnostics(),
+        diagnostics,
         find_gaps(sensor_stamps),
         {role: (int(s.min()), int(s.max())) for role, s in sensor_stamps.items()},
         stamps_ns,
@@ -223,7 +227,7 @@ def map_recording(
     return VehicleSubmaps(
         recording.vehicle_id,
         tuple(newest[key] for key in sorted(newest)),
-        mapper.diagnostics(),
+        diagnostics,
         (
             *findings,
             *reader.findings,
@@ -270,6 +274,16 @@ def _mounting_findings(mountings: Mountings, vehicle_id: str) -> list[Finding]:
         for frame_id, tilt_rad in sorted(mountings.tilted.items())
     ]
     return unknown + tilted
+
+
+def _new_run(reason: RunBreak) -> Finding:
+    what = "heading" if reason.role == "imu" else "velocity of the vehicle, which moves,"
+    return Finding(
+        "new_run",
+        reason.role,
+        f"its {what} is missing for {reason.seconds:.0f} s; what is mapped after that is a map of "
+        "its own, which only registration joins to the one before",
+    )
 
 
 def _late_heading(late_s: float) -> Finding:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.mapping import VehicleMapper
+from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleRuns
 from uw_dslam_ros2.core.mounting import (
     StaticFrames,
     fan_mount,
@@ -36,7 +36,15 @@ from uw_dslam_ros2.io.readings import (
     VelocityEvent,
 )
 
-__all__ = ["Mountings", "SensorEvent", "feed", "in_stamp_order", "role_of", "usual_mounting"]
+__all__ = [
+    "Mountings",
+    "SensorEvent",
+    "feed",
+    "feed_runs",
+    "in_stamp_order",
+    "role_of",
+    "usual_mounting",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -192,6 +200,24 @@ def feed(mapper: VehicleMapper, event: SensorEvent, T_base_sensor: FloatArray) -
         case DepthEvent():
             mapper.add_depth(stamp_ns, event.depth_m)
     return []
+
+
+def feed_runs(runs: VehicleRuns, event: SensorEvent, T_base_sensor: FloatArray) -> list[Submap]:
+    """Give one event to the run that it belongs to; see `feed`."""
+    issued: list[Submap] = []
+    stamp_ns = event.stamp_ns
+    if isinstance(event, PINGS) and runs.is_blind(stamp_ns):
+        return issued
+    if isinstance(event, PoseEvent) or (isinstance(event, ImuEvent) and _has_heading(event)):
+        issued += runs.note_heading(stamp_ns)
+    if isinstance(event, VelocityEvent) and np.isfinite(event.velocity_m_s).all():
+        issued += runs.note_velocity(stamp_ns, float(np.hypot(*event.velocity_m_s[:2])))
+    return issued + feed(runs.mapper, event, T_base_sensor)
+
+
+def _has_heading(event: ImuEvent) -> bool:
+    values = (event.yaw_rad, event.yaw_rate_rad_s)
+    return any(value is not None and math.isfinite(value) for value in values)
 
 
 def _seen_from_above(T_base_sensor: FloatArray) -> SE2:

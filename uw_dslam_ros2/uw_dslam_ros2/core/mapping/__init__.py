@@ -7,6 +7,7 @@ from uw_dslam_ros2.core.mapping.config import (
     SubmapConfig,
     VehicleMapperConfig,
 )
+from uw_dslam_ros2.core.mapping.runs import RunBreak, VehicleRuns
 from uw_dslam_ros2.core.mapping.vehicle_mapper import VehicleMapper
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
@@ -14,9 +15,11 @@ __all__ = [
     "LoopConfig",
     "MatchConfig",
     "OccupancyConfig",
+    "RunBreak",
     "Submap",
     "SubmapConfig",
     "SubmapId",
     "VehicleMapper",
     "VehicleMapperConfig",
+    "VehicleRuns",
 ]

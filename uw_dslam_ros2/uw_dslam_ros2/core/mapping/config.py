@@ -117,6 +117,13 @@ class VehicleMapperConfig(Config):
         doc="who places the pings: dead reckoning alone, scan matching with loop closures in a "
         "graph of submaps, or scan matching with a particle filter over submaps",
     )
+    max_gap_s: float = setting(
+        10.0,
+        1.0,
+        1e6,
+        "longest silence of the heading, or of the velocity while the vehicle moves, that is "
+        "bridged [s]; after a longer one a new run begins",
+    )
     sonar: SonarConfig = setting(SonarConfig())
     navigation: NavigationConfig = setting(NavigationConfig())
     occupancy: OccupancyConfig = setting(OccupancyConfig())

@@ -216,6 +216,11 @@ class VehicleMapper:
         return self._navigation.is_started
 
     @property
+    def num_pings(self) -> int:
+        """Pings mapped so far."""
+        return int(self._counts["num_pings"])
+
+    @property
     def stamp_ns(self) -> int | None:
         """Time of `T_odom_base`: of the newest navigation message; None before the first."""
         return self._navigation.stamp_ns

@@ -21,12 +21,12 @@ from uw_dslam_msgs.srv import GetSubmap
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
-from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
+from uw_dslam_ros2.core.mapping import RunBreak, VehicleMapper, VehicleMapperConfig, VehicleRuns
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
 from uw_dslam_ros2.io.conventions import correct, correct_mounting
 from uw_dslam_ros2.io.drivers import stamp_of
-from uw_dslam_ros2.io.feeding import SensorEvent, feed
+from uw_dslam_ros2.io.feeding import SensorEvent, feed_runs
 from uw_dslam_ros2.io.readings import (
     PINGS,
     DepthEvent,
@@ -57,7 +57,8 @@ from uw_dslam_ros2.ros.plumbing.worker import Worker
 
 __all__ = ["SonarMapper", "SonarMapperConfig", "main"]
 
-_JUMP_BACK_S = 1.0  # stamps that go back by more begin a new recording
+_JUMP_BACK_S = 1.0  # stamps that go back by more are late, or show a clock that was set
+_MANY_DISPLACED = 50
 _PATH_MAX_POSES = 2000  # a longer path is thinned when published
 _MAX_AHEAD_NS = 10_000_000_000
 _MOUNT_PATIENCE_NS = 5_000_000_000
@@ -83,9 +84,11 @@ class SonarMapper(Node):
                 "give one of them (-r __ns:=/auv_1)"
             )
         self._base_frame = self._config.base_frame or f"{self._vehicle_id}/base_link"
-        self._mapper = self._new_mapper()
+        self._runs = VehicleRuns(self._mapper_config, self._vehicle_id, _draw_run_id)
         self._order: StampOrder[SensorEvent] = StampOrder(
-            int(self._reorder_s() * 1e9), int(_JUMP_BACK_S * 1e9)
+            int(self._reorder_s() * 1e9),
+            int(_JUMP_BACK_S * 1e9),
+            int(self._mapper_config.max_gap_s * 1e9),
         )
         self._counts: Counter[str] = Counter()
         self._mapper_values: dict[str, float | int | str] = {}
@@ -94,6 +97,7 @@ class SonarMapper(Node):
         self._map_stamp_ns = 0
         self._drawing = Throttle(self._config.map_period_s)
         self._is_finished = False
+        self._num_breaks_told = 0
         self._heard_s = time.monotonic()
         self._worker = Worker("mapper", self._on_worker_error)
         self._create_publishers()
@@ -131,6 +135,11 @@ class SonarMapper(Node):
         """Stop, then destroy."""
         self.stop()
         super().destroy_node()
+
+    @property
+    def _mapper(self) -> VehicleMapper:
+        """Of the run that goes on."""
+        return self._runs.mapper
 
     def _reorder_s(self) -> float:
         """Live, a sensor that died must not hold up the others for long; in a replay it may."""
@@ -245,20 +254,18 @@ class SonarMapper(Node):
 
     def _take(self, stream: str, stamp_ns: int, event: SensorEvent | None) -> None:
         """Put an event in line; None only says how far the stream has come."""
-        if self._order.has_jumped_back(stream, stamp_ns):
-            self.get_logger().warning(
-                f"time went back on {stream}: a recording began again, and so does the map"
-            )
-            self._restart()
+        if self._order.newest_ns is None:
+            self._expect_streams(stamp_ns)
+        if self._order.offer(stream, stamp_ns, event):
+            self._begin_anew(stream, stamp_ns)
         if self._is_finished:
             self._complain(f"mapping was finished; messages on {stream} are left out")
             return
-        if self._order.newest_ns is None:
-            self._expect_streams(stamp_ns)
-        if event is None:
-            self._order.advance(stream, stamp_ns)
-        else:
-            self._order.add(stream, stamp_ns, event)
+        if self._order.displaced.get(stream, 0) > _MANY_DISPLACED:
+            self._complain(
+                f"the stamps of {stream} have jumped, and those of other sensors have not: its "
+                "messages are left out; are the clocks of both computers set?"
+            )
         self._drain()
 
     def _expect_streams(self, stamp_ns: int) -> None:
@@ -267,14 +274,19 @@ class SonarMapper(Node):
             if self.count_publishers(sensor.topic):
                 self._order.expect(sensor.name, stamp_ns - 1)  # its own may be of the same moment
 
-    def _new_mapper(self) -> VehicleMapper:
-        """A mapper for a new run: two that start in the same moment are told apart, too."""
-        run_id = 1 + secrets.randbelow(MAX_RUN_ID)
-        return VehicleMapper(self._mapper_config, self._vehicle_id, run_id)
-
-    def _restart(self) -> None:
-        self._order.clear()
-        self._mapper = self._new_mapper()
+    def _begin_anew(self, stream: str, stamp_ns: int) -> None:
+        """The clock was set, or a recording began again: what was mapped is kept as a run."""
+        newest_ns = self._order.newest_ns or stamp_ns
+        for event in self._order.rest():
+            self._feed(event)
+        self._order.begin_anew()
+        way = "back" if stamp_ns < newest_ns else "ahead"
+        self.get_logger().warning(
+            f"the clock went {way} by {abs(stamp_ns - newest_ns) * 1e-9:.1f} s (on {stream}): a "
+            "new run begins; what was mapped before is kept, and only registration joins the two"
+        )
+        reason = RunBreak("", newest_ns, stamp_ns)
+        self._publish_submaps(self._runs.begin(reason))
         self._odom_stamp_ns = self._map_stamp_ns = 0
         self._is_finished = False
         self._counts["num_restarts"] += 1
@@ -316,33 +328,47 @@ class SonarMapper(Node):
             return
         try:
             mounting = correct_mounting(event, T_base_sensor, self._config.conventions)
-            submaps = feed(self._mapper, event, mounting)
+            submaps = feed_runs(self._runs, event, mounting)
         except InvalidInputError as error:
             self._complain(f"{type(event).__name__} of {event.frame_id}: {error}")
             return
         self._publish_submaps(submaps)
+        self._note_breaks()
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is None:
             return
         if stamp_ns - self._odom_stamp_ns >= _ODOM_PERIOD_NS:
             self._publish_odometry(stamp_ns)
         if isinstance(event, PINGS):
-            self._mapper_values = self._mapper.diagnostics()
+            self._mapper_values = self._runs.diagnostics()
             is_old = stamp_ns - self._map_stamp_ns >= self._config.map_period_s * 1e9
             if is_old and self._drawing.is_due():
                 self._publish_map(stamp_ns)
+
+    def _note_breaks(self) -> None:
+        """Say so where a silence has begun a new run."""
+        for reason in self._runs.breaks[self._num_breaks_told :]:
+            self._odom_stamp_ns = self._map_stamp_ns = 0
+            if reason.role:
+                what = "heading" if reason.role == "imu" else "velocity"
+                self._last_problem = (
+                    f"no {what} for {reason.seconds:.0f} s: a new run begins; what was mapped "
+                    "before is kept, and only registration joins the two"
+                )
+                self.get_logger().warning(self._last_problem)
+        self._num_breaks_told = len(self._runs.breaks)
 
     def _finish(self) -> str:
         if self._is_finished:
             return "finished before; nothing changes"
         self._flush()
-        submaps = self._mapper.finish()
+        submaps = self._runs.finish()
         self._publish_submaps(submaps)
         self._is_finished = True
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is not None:
             self._publish_map(stamp_ns)
-        self._mapper_values = self._mapper.diagnostics()
+        self._mapper_values = self._runs.diagnostics()
         return (
             f"{self._mapper_values['num_pings']} pings mapped into "
             f"{self._mapper_values['num_submaps']} submaps; {self._counts['num_bad']} bad messages"
@@ -452,6 +478,11 @@ class SonarMapper(Node):
             return "info", ""
         text = "; ".join(f"{name}: no message for {age_s:.0f} s" for name, age_s in silent.items())
         return "error" if max(silent.values()) > _LOST_S else "warning", text
+
+
+def _draw_run_id() -> int:
+    """Different also for two mappers that start in the same moment."""
+    return 1 + secrets.randbelow(MAX_RUN_ID)
 
 
 @dataclass(slots=True)

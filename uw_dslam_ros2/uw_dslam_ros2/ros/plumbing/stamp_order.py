@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import heapq
 import itertools
+from collections import deque
 from collections.abc import Iterator
 
 __all__ = ["StampOrder"]
+
+_NEVER_NS = 1 << 62
+_BELIEVE_NS = 2_000_000_000
+_MAX_ASIDE = 20_000
+"""Items put aside in a stream: more than half a minute of a fast IMU."""
 
 
 class StampOrder[ItemT]:
@@ -17,21 +23,35 @@ class StampOrder[ItemT]:
     come as far; a stream that is `hold_ns` behind the youngest item is not waited for. Of equal
     stamps those leave first whose stream comes first by name: ``dvl``, ``imu``, then the pings.
 
+    What lies far back in its own stream, or far ahead of all, is put aside: it is late or wrong if
+    any stream goes on in the old time, and shows a clock that was set if all follow it.
+
     Parameters
     ----------
     hold_ns : how long a stream is waited for, in the time of the stamps.
-    jump_ns : a stream whose stamps go back by more than this has begun again.
+    back_ns : an item that lies further back in its stream is put aside.
+    ahead_ns : an item that lies further ahead of the youngest of all is put aside.
+    believe_ns : a jump that has lasted for so long is one.
     """
 
-    def __init__(self, hold_ns: int, jump_ns: int) -> None:
+    def __init__(
+        self,
+        hold_ns: int,
+        back_ns: int = _NEVER_NS,
+        ahead_ns: int = _NEVER_NS,
+        believe_ns: int = _BELIEVE_NS,
+    ) -> None:
         self._hold_ns = hold_ns
-        self._jump_ns = jump_ns
+        self._back_ns, self._ahead_ns = back_ns, ahead_ns
+        self._believe_ns = believe_ns
         self._ties = itertools.count()
         self.num_late = 0
         self.clear()
 
     def clear(self) -> None:
         """Forget everything."""
+        self._aside: dict[str, deque[tuple[int, ItemT | None]]] = {}
+        self._aside_since_ns: dict[str, int] = {}
         self._heap: list[tuple[int, str, int, ItemT]] = []
         self._newest_of_stream: dict[str, int] = {}
         self._alive: set[str] = set()
@@ -46,12 +66,55 @@ class StampOrder[ItemT]:
         """Stamp of the youngest item seen."""
         return max(self._newest_of_stream.values(), default=None)
 
-    def has_jumped_back(self, stream: str, stamp_ns: int) -> bool:
-        """Whether this stamp shows that a recording began again."""
-        newest_ns = self._newest_of_stream.get(stream)
-        if newest_ns is None or stream in self._unheard:
+    def offer(self, stream: str, stamp_ns: int, item: ItemT | None) -> bool:
+        """Take an item (None only says how far its stream has come).
+
+        True where a clock was set, by now beyond doubt: then what `rest` gives is of the old time,
+        and `begin_anew` goes on with the new one.
+        """
+        if self._is_displaced(stream, stamp_ns):
+            aside = self._aside.setdefault(stream, deque())
+            aside.append((stamp_ns, item))
+            if len(aside) > _MAX_ASIDE:
+                aside.popleft()
+                self.num_late += 1
+            since_ns = self._aside_since_ns.setdefault(stream, stamp_ns)
+            return stamp_ns - since_ns >= self._believe_ns
+        # The old time goes on: what is aside of this stream came late, and another stream's jump
+        # would have to last anew.
+        self.num_late += len(self._aside.pop(stream, ()))
+        self._aside_since_ns.clear()
+        if item is None:
+            self.advance(stream, stamp_ns)
+        else:
+            self.add(stream, stamp_ns, item)
+        return False
+
+    def begin_anew(self) -> None:
+        """Forget the old time; what was put aside is the beginning of the new one."""
+        aside, known = self._aside, sorted(self._newest_of_stream)
+        first_ns = min(stamp_ns for items in aside.values() for stamp_ns, _ in items)
+        self.clear()
+        for stream in known:
+            self.expect(stream, first_ns - 1)  # the others follow, but may not have done so yet
+        for stream, items in aside.items():
+            for stamp_ns, item in items:
+                self.offer(stream, stamp_ns, item)
+
+    @property
+    def displaced(self) -> dict[str, int]:
+        """How many items are put aside, by stream: of those whose clock alone was set, many."""
+        return {stream: len(items) for stream, items in self._aside.items()}
+
+    def _is_displaced(self, stream: str, stamp_ns: int) -> bool:
+        newest_ns = self.newest_ns
+        if newest_ns is None or self._unheard >= self._newest_of_stream.keys():
             return False
-        return stamp_ns < newest_ns - self._jump_ns
+        own_ns = self._newest_of_stream.get(stream)
+        is_back = own_ns is not None and stream not in self._unheard
+        if is_back and own_ns is not None and stamp_ns < own_ns - self._back_ns:
+            return True
+        return stamp_ns > newest_ns + self._ahead_ns
 
     def expect(self, stream: str, stamp_ns: int) -> None:
         """Wait for a stream that is about to begin as for one that has come so far."""
