@@ -59,3 +59,22 @@ def test_bad_points_are_refused(bad):
         sample_voxels(bad, 1.0)
     with pytest.raises(InvalidInputError):
         cluster_filter(bad)
+
+
+def _reachable(points, radius_m, min_size):
+    """Clusters as their definition has it: grown from core points, one neighbour at a time."""
+    near = np.linalg.norm(points[:, None] - points[None], axis=2) <= radius_m
+    is_core = near.sum(axis=1) >= min_size
+    found = is_core.copy()
+    for index in np.flatnonzero(is_core):
+        found |= near[index]
+    return found
+
+
+@pytest.mark.parametrize("min_size", [1, 3, 8])
+@pytest.mark.parametrize("factor", [0.5, 2.0, 6.0])
+def test_clusters_are_what_density_reaches(rng, factor, min_size):
+    points = rng.normal(size=(200, 2)) ** 3
+    expected = _reachable(points, factor * mean_spacing(points), min_size)
+    keep = cluster_filter(points, radius_factor=factor, min_cluster_size=min_size)
+    np.testing.assert_array_equal(keep, expected)

@@ -7,7 +7,6 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -111,6 +110,8 @@ def _plain_pixels(path: Path, text: bytes) -> NDArray[np.int64]:
 
 
 def _decode(path: Path, content: bytes) -> tuple[NDArray[Any], int]:
+    import cv2  # large, and not every program has pictures
+
     try:
         image = (
             cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)

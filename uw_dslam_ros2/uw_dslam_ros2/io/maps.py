@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -196,6 +195,8 @@ def _pgm_bytes(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _png_bytes(pixels: NDArray[np.uint8]) -> bytes:
+    import cv2  # large, and not every program has pictures
+
     is_done, buffer = cv2.imencode(".png", np.ascontiguousarray(pixels))
     if not is_done:
         raise DataError(f"cannot encode a {pixels.shape[1]} x {pixels.shape[0]} picture as PNG")

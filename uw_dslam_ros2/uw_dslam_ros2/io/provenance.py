@@ -6,7 +6,6 @@ import io
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from uw_dslam_ros2.core.errors import DataError
@@ -96,6 +95,8 @@ def _submap_id(text: str) -> SubmapId:
 
 def contradictions_png(provenance: MapProvenance) -> bytes:
     """Picture of where submaps disagree, as `write_provenance` describes it."""
+    import cv2  # large, and not every program has pictures
+
     colors = np.array([_AGREED, *_DISPUTED], dtype=np.uint8)
     pixels = colors[np.minimum(provenance.contradictions, len(_DISPUTED))]
     pixels[provenance.owners == 0] = _NOT_SEEN

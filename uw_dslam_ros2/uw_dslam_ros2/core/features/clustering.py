@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.cluster import DBSCAN
-from sklearn.neighbors import NearestNeighbors
+from scipy.spatial import cKDTree
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 
@@ -21,7 +20,7 @@ def mean_spacing(points: ArrayLike) -> float:
     array = _checked(points)
     if len(array) < 2:
         return 0.0
-    distances, _ = NearestNeighbors(n_neighbors=2).fit(array).kneighbors(array)
+    distances, _ = cKDTree(array).query(array, k=2)
     return float(distances[:, 1].mean())
 
 
@@ -49,8 +48,13 @@ def cluster_filter(
     if len(array) == 0:
         return np.zeros(0, dtype=np.bool_)
     radius_m = max(radius_factor * mean_spacing(array), 1e-12)
-    labels = DBSCAN(eps=radius_m, min_samples=min_cluster_size).fit_predict(array)
-    return np.asarray(labels >= 0)
+    # Which cluster a point is in does not matter here, so the clusters need not be grown.
+    counts = cKDTree(array).query_ball_point(array, radius_m, return_length=True)
+    is_core = np.asarray(counts) >= min_cluster_size
+    if not is_core.any():
+        return is_core
+    distances, _ = cKDTree(array[is_core]).query(array)
+    return np.asarray(distances <= radius_m)
 
 
 def _checked(points: ArrayLike) -> FloatArray:

@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 
@@ -68,6 +67,8 @@ def smallest_of_factor(num_side: int, false_alarm_rate: float) -> float:
     low, high = 0.0, 2.0 * cell_averaging_factor(num_side, false_alarm_rate) + 1.0
     while _smallest_of_rate(high, num_side) > false_alarm_rate:
         high *= 2.0
+    from scipy.optimize import brentq  # large, and few detectors need it
+
     return float(
         brentq(lambda a: _smallest_of_rate(a, num_side) - false_alarm_rate, low, high, rtol=1e-12)
     )

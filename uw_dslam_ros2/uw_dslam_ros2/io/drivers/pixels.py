@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,6 +130,8 @@ def image_pixels(msg: Any, field: str = "data") -> Pixels:
 
 def decoded(data: Any, field: str) -> Pixels:
     """Pixels of a JPEG or PNG."""
+    import cv2  # large, and not every program has pictures
+
     raw = as_bytes(data, field)
     image = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if len(raw) else None
     if image is None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from uw_dslam_ros2.core.registration.grids import landscape_kernels
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
@@ -95,6 +94,8 @@ class _Scan:
     """Transforms that all rotations share."""
 
     def __init__(self, problem: GridProblem) -> None:
+        from scipy import fft  # large, and not every node that starts will search
+
         self._problem = problem
         rows, cols = (size - 2 * PAD for size in problem.source_field.coefficients.shape)
         # The turned source is drawn about its middle, so any angle fits into this square.
@@ -145,6 +146,8 @@ class _Scan:
 
     def _scores(self, thetas: FloatArray, places: FloatArray) -> FloatStack:
         """Objective (K, R, C) by lag between the square and the target with a rim of one cell."""
+        from scipy import fft
+
         problem = self._problem
         stack = self._stack[: len(thetas)]
         landscape_kernels.draw_turned(
