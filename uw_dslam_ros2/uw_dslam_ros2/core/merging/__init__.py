@@ -2,6 +2,7 @@
 
 from uw_dslam_ros2.core.merging.components import LoopError
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.growing_map import GrowingMap, GrowingMapConfig, MapChange
 from uw_dslam_ros2.core.merging.queue import MapQueue
 from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
@@ -16,7 +17,10 @@ from uw_dslam_ros2.core.merging.types import (
 __all__ = [
     "Constraint",
     "ConstraintKind",
+    "GrowingMap",
+    "GrowingMapConfig",
     "LoopError",
+    "MapChange",
     "MapProvenance",
     "MapQueue",
     "MapQueueConfig",

@@ -127,6 +127,22 @@ class MapQueue:
         """Forget that a request was asked (its server died); it will be asked again."""
         self._in_flight.pop(request_id, None)
 
+    def forget_answers(self, vehicle_id: str) -> None:
+        """Forget what was found about a vehicle's map: it is not any more what it was."""
+        about = {
+            key
+            for key, answer in self._answers.items()
+            if any(
+                submap_id.vehicle_id == vehicle_id
+                for group in (answer.query.source, answer.query.target)
+                for submap_id in group.ids
+            )
+        }
+        if about:
+            self._answers = {k: a for k, a in self._answers.items() if k not in about}
+            self._standing -= about
+            self._change()
+
     @property
     def is_growing(self) -> bool:
         """Whether more submaps are expected soon; False at first.
