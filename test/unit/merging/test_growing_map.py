@@ -45,7 +45,7 @@ def ids(change):
 
 def test_every_known_cell_is_in_one_tile_and_where_it_was():
     whole = drawn(PATH)
-    growing = GrowingMap("robot", GrowingMapConfig(tile_m=10.0, min_change=0.5))
+    growing = GrowingMap("robot", GrowingMapConfig(tile_m=10.0, min_change=0.85))
     first, rest = growing.update(whole, 5).submaps, growing.rest().submaps
     assert first
     assert rest
