@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import SonarConfig, detections_from_scan
 from uw_dslam_ros2.sim.world import cast_rays
 
-CONFIG = VehicleMapperConfig(occupancy=OccupancyConfig(resolution_m=0.1))
+CONFIG = VehicleMapperConfig(occupancy=OccupancyConfig(resolution_m=0.1)).suited(0.01)
 SPACING = 4.0
 BEARINGS = np.linspace(-1.1, 1.1, 120)
 S = 1_000_000_000

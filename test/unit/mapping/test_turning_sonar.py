@@ -4,9 +4,15 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from uw_dslam_ros2.core.grid import OCCUPIED
-from uw_dslam_ros2.core.mapping import OccupancyConfig, VehicleMapper, VehicleMapperConfig
+from uw_dslam_ros2.core.mapping import (
+    MatchConfig,
+    OccupancyConfig,
+    VehicleMapper,
+    VehicleMapperConfig,
+)
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import Beams
 
@@ -138,3 +144,19 @@ def test_a_ten_times_larger_range_takes_no_more_memory_than_its_water():
     mapper.add_beams(beams, SONAR)
     mapper.finish()
     assert max(mapper.vehicle_map().spec.shape) <= 2 * 25.0 / 0.05 + 2
+
+
+def test_what_is_left_to_the_sonar_goes_by_its_beams():
+    fan, turning = (MatchConfig().suited(width_rad) for width_rad in (0.009, 0.0314))
+    assert (fan.sigma_m, fan.information_share) == (0.12, 0.1)
+    assert turning.sigma_m == pytest.approx(0.25, abs=0.01)
+    assert turning.information_share == pytest.approx(0.36, abs=0.01)
+    own = MatchConfig(sigma_m=0.4, information_share=0.2)
+    assert own.suited(0.0314) == own
+
+
+def test_loops_see_the_walls_between_wide_beams(by_beams):
+    """Echoes of a turn lie metres apart, and those of another turn somewhere between them."""
+    points = by_beams[1][0].points
+    spacing_m, _ = cKDTree(points).query(points, k=2)
+    assert spacing_m[:, 1].max() < 0.6

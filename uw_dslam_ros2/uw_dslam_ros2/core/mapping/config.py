@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.navigation.config import NavigationConfig
@@ -10,6 +10,7 @@ from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.sonar.config import SonarConfig
 
 __all__ = [
+    "WIDE_BEAM_RAD",
     "LoopConfig",
     "MatchConfig",
     "OccupancyConfig",
@@ -17,6 +18,14 @@ __all__ = [
     "SubmapConfig",
     "VehicleMapperConfig",
 ]
+
+
+WIDE_BEAM_RAD = 0.021
+"""Wider beams leave gaps between the echoes of a wall."""
+_USUAL_RANGE_M = 16.0
+_SIGMA_M, _SHARE = 0.12, 0.1
+_RELATED_RAD = 0.087
+"""Echoes of beams nearer than five degrees err together: ten of a fan, three of a turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +65,11 @@ class MatchConfig(Config):
     """Scan-to-submap matching."""
 
     sigma_m: float = setting(
-        0.12, 0.01, 10.0, "width of the likelihood field: noise of an echo [m]"
+        0.0,
+        0.0,
+        10.0,
+        "width of the likelihood field: noise of an echo [m]; 0: 0.12, or what the spacing of "
+        "wide beams (a sonar that turns) leaves open",
     )
     key_distance_m: float = setting(
         1.0, 0.0, 100.0, "a ping is matched after this path length [m] ..."
@@ -69,8 +82,23 @@ class MatchConfig(Config):
         15.0, 0.1, 1e4, "path length whose echoes a ping is matched against [m]"
     )
     information_share: float = setting(
-        0.1, 0.001, 1.0, "independent information per echo: neighbouring echoes err together"
+        0.0,
+        0.0,
+        1.0,
+        "independent information per echo: neighbouring echoes err together; 0: 0.1, more for "
+        "wide beams",
     )
+
+    def suited(self, beamwidth_rad: float) -> MatchConfig:
+        """Settings with what was left to the sonar filled in, by its beams' spacing."""
+        is_wide = beamwidth_rad >= WIDE_BEAM_RAD
+        sigma_m = max(_SIGMA_M, 0.5 * beamwidth_rad * _USUAL_RANGE_M) if is_wide else _SIGMA_M
+        share = min(1.0, beamwidth_rad / _RELATED_RAD) if is_wide else _SHARE
+        return replace(
+            self,
+            sigma_m=self.sigma_m or sigma_m,
+            information_share=self.information_share or share,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,3 +159,7 @@ class VehicleMapperConfig(Config):
     match: MatchConfig = setting(MatchConfig())
     loop: LoopConfig = setting(LoopConfig())
     particles: ParticleConfig = setting(ParticleConfig())
+
+    def suited(self, beamwidth_rad: float) -> VehicleMapperConfig:
+        """Settings with what was left to the sonar filled in, by its beams' spacing [rad]."""
+        return replace(self, match=self.match.suited(beamwidth_rad))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from uw_dslam_ros2.core.mapping.config import MatchConfig
+from uw_dslam_ros2.core.mapping.config import WIDE_BEAM_RAD, MatchConfig
 from uw_dslam_ros2.core.mapping.matcher import (
     LikelihoodField,
     Prior,
@@ -18,7 +18,7 @@ from uw_dslam_ros2.core.mapping.matcher import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["WIDE_BEAM_RAD", "LocalMap", "joined"]
+__all__ = ["LocalMap", "joined"]
 
 FloatArray = NDArray[np.float64]
 _COARSEST = 8.0
@@ -27,8 +27,6 @@ _MIN_POINTS = 20
 _MAX_POINTS = 300
 """Of more echoes an even choice is matched: more of the same walls add time, not accuracy."""
 
-WIDE_BEAM_RAD = 0.021
-"""Wider beams leave gaps between the echoes of a wall."""
 _NEAR_M = 1.0
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import SubmapConfig, VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.local_map import joined
 from uw_dslam_ros2.core.mapping.matcher import thin
 from uw_dslam_ros2.core.mapping.occupancy import CompressedGrid, GrowingGrid
 from uw_dslam_ros2.core.se2 import SE2
@@ -107,7 +108,9 @@ class OpenSection:
         self.num_pings += 1
         if self._is_due(stamp_ns, T_submap_base):
             self._last_mapped = (stamp_ns, T_submap_base)
-            self._draw(detections, T_submap_base @ T_base_sonar)
+            T_submap_sonar = T_submap_base @ T_base_sonar
+            self.grid.add(detections, T_submap_sonar)
+            self._keep(detections, T_submap_sonar)
 
     def add_sweep(self, sweep: PlacedSweep, T_submap_reference: SE2) -> None:
         """Add a sweep of a sonar that turns: all its beams, each from its own place."""
@@ -115,7 +118,8 @@ class OpenSection:
             self._go_on(int(stamp_ns), T_submap_reference @ SE2.from_array(pose))
         self.num_pings += 1
         for part in sweep.slices:
-            self._draw(part.detections, T_submap_reference @ part.T_reference_sonar)
+            self.grid.add(part.detections, T_submap_reference @ part.T_reference_sonar)
+        self._keep(sweep.detections, T_submap_reference)
 
     def _go_on(self, stamp_ns: int, T_submap_base: SE2) -> None:
         if self._trajectory:
@@ -124,11 +128,17 @@ class OpenSection:
         self._trajectory.append((T_submap_base.x, T_submap_base.y, T_submap_base.yaw))
         self._stamps_ns.append(stamp_ns)
 
-    def _draw(self, detections: Detections, T_submap_sonar: SE2) -> None:
-        self.grid.add(detections, T_submap_sonar)
+    def _keep(self, detections: Detections, T_submap_sonar: SE2) -> None:
+        """Keep the echoes, and the walls between those of wide beams, for matching."""
         if len(detections.points):
-            self._points.append(T_submap_sonar.apply(detections.points))
-            self._weight.append(detections.weight)
+            points, weight = joined(
+                detections.points,
+                detections.weight,
+                detections.beamwidth_rad,
+                self._config.match.sigma_m,
+            )
+            self._points.append(T_submap_sonar.apply(points))
+            self._weight.append(weight)
 
     def should_close(self, stamp_ns: int, sigma_m: float) -> bool:
         """Whether it has become long, old or uncertain enough."""

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.config import WIDE_BEAM_RAD, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.estimators import make_estimator
-from uw_dslam_ros2.core.mapping.local_map import WIDE_BEAM_RAD, LocalMap, joined
+from uw_dslam_ros2.core.mapping.local_map import LocalMap, joined
 from uw_dslam_ros2.core.mapping.matcher import Prior
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.mosaic import Mosaic
@@ -44,6 +44,7 @@ _TURN_MEMORY_S = 120.0
 """A turn takes up to 35 s, and its message may come when the next one is complete."""
 _AHEAD_NS = 1_000_000_000
 """At the end, beams this much newer than all navigation are placed by its last velocity."""
+_FAN_BEAM_RAD = 0.01
 _MIN_OVERLAP = 0.3
 """Least share of a ping's echoes that must meet known ones for a match to be believed."""
 
@@ -63,11 +64,10 @@ class VehicleMapper:
             raise InvalidInputError("vehicle_id is empty, expected a name")
         if not 0 < run_id <= MAX_RUN_ID:
             raise InvalidInputError(f"run_id is {run_id}, expected 1 to {MAX_RUN_ID}")
-        self._config = config
+        self._own_config = config
         self._vehicle_id, self._run_id = vehicle_id, run_id
         self._navigation = NavigationFilter(config.navigation)
-        self._estimator = make_estimator(config)
-        self._local_map = LocalMap(config.match)
+        self._suit(_FAN_BEAM_RAD)
         self._mosaic = Mosaic(GridSpec(config.occupancy.resolution_m, 1, 1))
         self._closed: list[ClosedSection] = []
         self._open: OpenSection | None = None
@@ -337,8 +337,15 @@ class VehicleMapper:
             return []
         if self._last_ping_ns is None:
             self._navigation.remember(0.0 if sweep is None else _TURN_MEMORY_S)
+            self._suit(detections.beamwidth_rad)
         self._last_ping_ns = detections.stamp_ns
         return self._process(detections, T_base_sonar, sweep)
+
+    def _suit(self, beamwidth_rad: float) -> None:
+        """Take settings that are left to the sonar from the first that is known of it."""
+        self._config = self._own_config.suited(beamwidth_rad)
+        self._estimator = make_estimator(self._config)
+        self._local_map = LocalMap(self._config.match)
 
     def _add_sweeps(self, sweeps: list[Sweep]) -> list[Submap]:
         issued: list[Submap] = []

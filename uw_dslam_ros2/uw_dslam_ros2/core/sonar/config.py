@@ -63,8 +63,8 @@ class SonarConfig(Config):
         0.5,
         0.0,
         100.0,
-        "an echo needs neighbours this near, or is dropped [m], beam spread added; 0: off, as for "
-        "echoes that are filtered already",
+        "an echo of a fan needs neighbours this near, or is dropped [m], beam spread added; 0: "
+        "off, as for echoes that are filtered already and always for sonars that turn",
         is_basic=True,
     )
     min_neighbors: int = setting(

@@ -91,7 +91,7 @@ def detections_from_points(
 
     Which beams met nothing is not known, so the water counts as free only before the nearest point
     of a bearing. Points all round are a turn of a sonar with a single beam: they lie as far from
-    one another as its beams, and come out in their order.
+    one another as its beams, and come out in their order, not filtered by neighbours.
     """
     xy = np.asarray(points, dtype=np.float64)
     if xy.ndim != 2 or xy.shape[1] != 2:
@@ -106,7 +106,9 @@ def detections_from_points(
         order = np.argsort(np.arctan2(xy[:, 1], xy[:, 0]), kind="stable")
         xy, ranges = xy[order], ranges[order]
     width = config.beamwidth_rad or spacing_rad or beam_spacing_rad
-    keep = has_neighbors(xy, width, config)
+    keep = np.ones(len(xy), np.bool_)
+    if spacing_rad == 0.0:
+        keep = has_neighbors(xy, width, config)
     beams = np.floor(np.arctan2(xy[:, 1], xy[:, 0]) / width).astype(np.int64)
     unique, inverse = np.unique(beams, return_inverse=True)
     nearest = np.full(len(unique), np.inf)
@@ -235,17 +237,15 @@ def has_neighbors(
     points: FloatArray,
     beamwidth_rad: float,
     config: SonarConfig,
-    range_m: FloatArray | None = None,
 ) -> NDArray[np.bool_]:
     """Distance-constrained filter: which points (N, 2) have `min_neighbors` others near them.
 
     Beams spread, so the reach grows by the distance between two neighbouring beams at the point's
-    range (N,): from the frame's zero unless it is given.
+    range from the frame's zero.
     """
     if config.neighbor_distance_m <= 0.0 or len(points) == 0:
         return np.ones(len(points), np.bool_)
-    if range_m is None:
-        range_m = np.hypot(points[:, 0], points[:, 1])
+    range_m = np.hypot(points[:, 0], points[:, 1])
     reach = config.neighbor_distance_m + beamwidth_rad * range_m
     order = np.argsort(points[:, 0], kind="stable")
     counts = np.empty(len(points), np.int64)

@@ -19,7 +19,6 @@ from uw_dslam_ros2.core.sonar.config import SonarConfig
 from uw_dslam_ros2.core.sonar.detect import (
     BeamEchoes,
     beam_spacing,
-    has_neighbors,
     image_echoes,
     polar,
     scan_echoes,
@@ -305,8 +304,7 @@ def place_sweep(
 ) -> PlacedSweep:
     """Place each beam of a sweep by the pose of base_link (B of them) at its own time.
 
-    The filter by neighbours sees the echoes where they really lie, of the sweep as a whole; where
-    there are too few beams for an echo to have neighbours it is left out.
+    There is no filter by neighbours: on a wall at a slant the next echo is metres away.
     """
     echoes, bearing = sweep.echoes(config), sweep.bearing_rad
     sonar = np.array([
@@ -317,10 +315,7 @@ def place_sweep(
         echoes.range_m, bearing[echoes.beam] + sonar[echoes.beam, 2]
     )
     width_rad = beam_spacing(bearing, config)
-    keep = np.ones(len(points), np.bool_)
-    if len(bearing) > config.min_neighbors:
-        keep = has_neighbors(points, width_rad, config, echoes.range_m)
-    beam, points, weight = echoes.beam[keep], points[keep], echoes.weight[keep]
+    beam, weight = echoes.beam, echoes.weight
     slices = []
     for part in _parts(sonar):
         T_reference_sonar = SE2.from_array(sonar[part.start])
