@@ -8,13 +8,21 @@ from uw_dslam_ros2.core.link.codec import (
     encode_submap,
     read_outline,
 )
+from uw_dslam_ros2.core.link.items import LayerKey
+from uw_dslam_ros2.core.link.link import AcousticLink
 from uw_dslam_ros2.core.link.outline import Outline
+from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState
 
 __all__ = [
     "CODEC_VERSION",
+    "AcousticLink",
     "CellLayer",
     "Layer",
+    "LayerKey",
     "LayeredSubmap",
+    "LinkConfig",
+    "LinkCounts",
+    "LinkState",
     "Outline",
     "encode_submap",
     "read_outline",

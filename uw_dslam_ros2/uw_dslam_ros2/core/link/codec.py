@@ -57,7 +57,8 @@ class Layer(enum.IntEnum):
 class CellLayer:
     """Decoded cells (R, C) of one layer, from a corner that all layers of a submap share.
 
-    ``tag`` is the checksum of all that was decoded, and of the layer that it builds on.
+    ``tag`` is the checksum of all that was decoded, and of the layer that it builds on;
+    ``first_tag`` is that of the coarse layer, which the outline names.
     """
 
     layer: Layer
@@ -67,6 +68,7 @@ class CellLayer:
     stamps_ns: NDArray[np.int64]
     trajectory: NDArray[np.float64]
     tag: bytes
+    first_tag: bytes
 
     @property
     def resolution_m(self) -> float:
@@ -113,18 +115,22 @@ class LayeredSubmap:
         self.cells = _read_finer(reader, self.cells, layer, self._key)
         return layer
 
-    def submap(self, vehicle_id: str) -> Submap | None:
-        """The submap as the layers have it; None before the outline and its cells are there.
+    @property
+    def revision(self) -> int | None:
+        """Of `submap`: grows with the outline's and with each finer layer; None without one."""
+        if self.outline is None or self.cells is None or self.cells.first_tag != self.outline.tag:
+            return None
+        return 4 * self.outline.revision + int(self.cells.layer)
 
-        Its revision grows with the outline's and with each finer layer.
-        """
-        outline, cells = self.outline, self.cells
-        if outline is None or cells is None:
+    def submap(self, vehicle_id: str) -> Submap | None:
+        """The submap as the layers have it; None before the outline and the cells it names."""
+        outline, cells, revision = self.outline, self.cells, self.revision
+        if outline is None or cells is None or revision is None:
             return None
         return Submap(
             vehicle_id,
             outline.sequence,
-            4 * outline.revision + int(cells.layer),
+            revision,
             outline.is_final,
             int(cells.stamps_ns[-1]) if len(cells.stamps_ns) else 0,
             outline.T_odom_submap,
@@ -137,6 +143,7 @@ class LayeredSubmap:
             ),
             trajectory=cells.trajectory,
             trajectory_stamp_ns=cells.stamps_ns,
+            run_id=outline.run_id,
         )
 
 
@@ -172,7 +179,7 @@ def encode_submap(
         coarse.cells, coarse.resolution_m, (corner[0] * _CORNER_M, corner[1] * _CORNER_M)
     )
     outline = Outline(
-        getattr(submap, "run_id", 0),
+        submap.run_id,
         submap.sequence,
         submap.revision,
         submap.is_final,
@@ -313,7 +320,7 @@ def _tagged(
     key: bytes,
 ) -> CellLayer:
     tag = digest_of(head + path[1].tobytes() + cells.tobytes(), key)
-    return CellLayer(Layer.COARSE, unit, corner, cells, *path, tag)
+    return CellLayer(Layer.COARSE, unit, corner, cells, *path, tag, tag)
 
 
 def _write_finer(
@@ -341,5 +348,12 @@ def _decoded_finer(data: bytes, below: CellLayer, layer: Layer, key: bytes) -> C
 def _refined(below: CellLayer, layer: Layer, cells: CellArray, key: bytes) -> CellLayer:
     tag = digest_of(below.tag + cells.tobytes(), key)
     return CellLayer(
-        layer, below.unit, below.corner, cells, below.stamps_ns, below.trajectory, tag
+        layer,
+        below.unit,
+        below.corner,
+        cells,
+        below.stamps_ns,
+        below.trajectory,
+        tag,
+        below.first_tag,
     )

@@ -1,0 +1,273 @@
+"""Several links over a channel that loses packets."""
+
+import dataclasses
+
+import numpy as np
+import places
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from unit.link.talk import Talk
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.link import AcousticLink, Layer, LayerKey, LinkConfig
+from uw_dslam_ros2.core.link.packets import OVERHEAD_BYTES
+from uw_dslam_ros2.core.se2 import SE2
+
+
+def own_submap(number, sequence, revision=0, run_id=77, seed=None):
+    whole = places.room_submap(
+        f"auv_{number}", sequence, revision, T_odom_submap=SE2(3.0 * sequence, number, 0.1)
+    )
+    values = np.array(whole.grid.values)
+    rng = np.random.default_rng([number, sequence] if seed is None else seed)
+    for row, col in rng.integers(10, 80, (12, 2)):
+        values[row : row + 4, col : col + 4] = 100
+    return dataclasses.replace(whole, grid=OccupancyMap(whole.grid.spec, values), run_id=run_id)
+
+
+def content(submap):
+    return (
+        submap.submap_id, submap.revision, submap.T_odom_submap, submap.grid.spec,
+        submap.grid.values.tobytes(), submap.trajectory.tobytes(), submap.covariance.tobytes(),
+    )  # fmt: skip
+
+
+def same_everywhere(talk):
+    everything = [
+        {key: content(submap) for key, submap in sorted(got.items())} for got in talk.got.values()
+    ]
+    return all(one == everything[0] for one in everything)
+
+
+def fleet(num_submaps=2, **options):
+    talk = Talk(**options)
+    for number in talk.links:
+        for sequence in range(num_submaps):
+            talk.add(own_submap(number, sequence))
+    return talk
+
+
+@pytest.mark.parametrize("packet_bytes", [32, 64, 256, 2048])
+def test_everybody_gets_everything(packet_bytes):
+    talk = fleet(packet_bytes=packet_bytes)
+    talk.until_all_know(6, 400.0)
+    assert same_everywhere(talk)
+    assert talk.links[2].name_of(3) == "auv_3"
+
+
+def test_without_loss_nothing_is_sent_twice():
+    talk = fleet()
+    talk.until_all_know(6, 100.0)
+    talk.run(talk.now_s + 300.0)
+    for link in talk.links.values():
+        assert link.counts.duplicates == 0
+        assert link.counts.repairs == 0
+        assert link.num_open(talk.now_s) == 0
+
+
+def test_who_has_nothing_to_say_is_nearly_silent():
+    talk = fleet()
+    talk.until_all_know(6, 100.0)
+    talk.run(talk.now_s + 30.0)
+    before = len(talk.packets)
+    talk.run(talk.now_s + 600.0)
+    assert len(talk.packets) - before <= 3 * 11  # a sign of life each minute
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_losses_are_repaired_and_cost_little_more_than_they_must(seed):
+    talk = fleet(loss=0.3, seed=seed)
+    talk.until_all_know(6, 400.0)
+    assert same_everywhere(talk)
+    talk.run(talk.now_s + 200.0)
+    assert all(link.num_open(talk.now_s) == 0 for link in talk.links.values())
+    parts = [item.parts for link in talk.links.values() for item in link._outbox.items]
+    sent = [item.num_sent for link in talk.links.values() for item in link._outbox.items]
+    # Until two receivers who miss 30 % each have all of one fragment takes 1.76 on average.
+    assert sum(sent) < 2.2 * sum(parts)
+
+
+def test_aloha_collides_and_arrives_all_the_same():
+    talk = fleet(access="aloha")
+    talk.until_all_know(6, 900.0)
+    assert talk.channel.counts.collided > 0
+    assert same_everywhere(talk)
+
+
+def test_a_blackout_of_half_the_time_changes_nothing_in_the_end():
+    talk = Talk(blackouts=[(20.0, 120.0)], loss=0.2)
+    for sequence in range(4):
+        for number in talk.links:
+            talk.add(own_submap(number, sequence))
+        talk.run(talk.now_s + 40.0)
+    talk.until_all_know(12, 900.0)
+    assert same_everywhere(talk)
+
+
+def test_a_latecomer_gets_all():
+    talk = fleet(num=3)
+    late, got = talk.links.pop(3), talk.got.pop(3)
+    talk.until_all_know(4, 200.0)
+    talk.run(600.0)
+    talk.links[3], talk.got[3] = late, got
+    talk.until_all_know(6, 1200.0)
+    assert same_everywhere(talk)
+
+
+def test_a_pose_that_moves_goes_out_without_its_cells():
+    talk = fleet()
+    talk.until_all_know(6, 100.0)
+    before = talk.links[1].counts.sent_bytes["coarse"]
+    moved = dataclasses.replace(own_submap(1, 0, revision=5), T_odom_submap=SE2(1.0, 2.0, 3.0))
+    talk.add(moved)
+    talk.run(talk.now_s + 30.0)
+    assert talk.got[2][moved.submap_id].T_odom_submap.y == pytest.approx(2.0)
+    assert talk.links[1].counts.sent_bytes["coarse"] == before
+
+
+def test_what_was_overtaken_need_not_arrive():
+    """Outlines that were lost and replaced are not sent again."""
+    talk = Talk(num=2, blackouts=[(0.0, 30.0)])
+    for revision in range(5):
+        talk.add(own_submap(1, 0, revision=revision))
+        talk.run(talk.now_s + 6.0)
+    talk.until_all_know(1, 300.0)
+    talk.run(talk.now_s + 200.0)
+    assert talk.got[2][own_submap(1, 0).submap_id].revision == 4 * 4 + Layer.COARSE
+    assert talk.links[2].is_complete
+    assert talk.links[1].num_open(talk.now_s) == 0
+
+
+def test_detail_comes_where_it_is_asked_for():
+    talk = fleet(loss=0.2)
+    talk.until_all_know(6, 300.0)
+    key = LayerKey.of(77, 1, Layer.MEDIUM)
+    talk.links[2].ask(3, key)
+    talk.run(talk.now_s + 120.0)
+    asked = own_submap(3, 1).submap_id
+    sizes = {n: got[asked].grid.spec.resolution_m for n, got in talk.got.items()}
+    assert sizes == pytest.approx({1: 0.2, 2: 0.2, 3: 0.2})  # all overhear it, the owner too
+    others = [s.grid.spec.resolution_m for i, s in talk.got[1].items() if i != asked]
+    assert others == pytest.approx([0.3] * 5)
+    assert same_everywhere(talk)
+
+
+def test_a_restarted_link_has_lost_nothing_and_sends_nothing_again():
+    talk = fleet()
+    talk.run(6.0)  # some have come
+    for number in (1, 2, 3):
+        old = talk.links[number]
+        new = AcousticLink.from_state(LinkConfig(number=number), f"auv_{number}", old.to_state())
+        assert [content(s) for s in new.submaps()] == [content(s) for s in old.submaps()]
+        talk.links[number] = new
+    talk.until_all_know(6, 200.0)
+    assert same_everywhere(talk)
+    assert sum(link.counts.repairs for link in talk.links.values()) <= 6
+
+
+def test_a_link_that_forgot_everything_begins_a_new_epoch():
+    talk = fleet()
+    talk.until_all_know(6, 200.0)
+    talk.links[1] = AcousticLink(LinkConfig(number=1), "auv_1", epoch=1)
+    talk.got[1] = {}
+    talk.add(own_submap(1, 2))
+    talk.run(400.0)
+    assert len(talk.got[1]) == 5  # its own new one and the four of the others
+    assert len(talk.got[2]) == 7
+
+
+def test_two_runs_of_a_vehicle_are_two():
+    talk = Talk(num=2)
+    talk.add(own_submap(1, 0, run_id=70_001, seed=1))
+    talk.add(own_submap(1, 0, run_id=5, seed=2))
+    talk.run(60.0)
+    assert {i.run_id for i in talk.got[2]} == {70_001, 5}
+
+
+# --- what is not as it should be ---------------------------------------------------------------
+
+
+@given(st.randoms(use_true_random=False))
+@settings(max_examples=25)
+def test_damage_is_counted_and_never_makes_a_wrong_submap(chance):
+    talk = fleet(num_submaps=1, num=2)
+    talk.until_all_know(2, 100.0)
+    wanted = content(talk.got[1][own_submap(1, 0).submap_id])
+    packets = [data for _, number, data in talk.packets if number == 1]
+    link = AcousticLink(LinkConfig(number=2), "auv_2")
+    found, num_damaged = [], 0
+    for data in packets:
+        damaged = bytearray(data)
+        way = chance.randrange(4)
+        if way == 0:
+            damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
+        elif way == 1:
+            del damaged[chance.randrange(len(damaged)) :]
+        elif way == 2:
+            damaged += bytes(chance.randrange(1, 9))
+        num_damaged += way != 3
+        for one in (bytes(damaged), data, data):
+            found += link.receive(one, 1.0)
+    assert [content(submap) for submap in found] == [wanted]
+    # One in 65536 passes the packet's checksum; the item's own has to catch that.
+    assert sum(link.counts.refused.values()) >= num_damaged - 1
+    assert link.counts.duplicates > 0
+
+
+@given(st.binary(max_size=100))
+def test_noise_is_counted(data):
+    link = AcousticLink(LinkConfig(), "auv_1")
+    assert link.receive(data, 0.0) == []
+    assert sum(link.counts.refused.values()) == 1
+
+
+def test_packets_with_a_sound_checksum_and_any_content_harm_nothing(rng):
+    from uw_dslam_ros2.core.link.packets import Packet
+
+    link = AcousticLink(LinkConfig(number=1), "auv_1")
+    for _ in range(2000):
+        fields = [int(rng.integers(0, n)) for n in (4, 32, 1024, 64, 128)]
+        payload = rng.bytes(int(rng.integers(1, 58)))
+        assert link.receive(Packet(*fields, payload).pack(b""), 0.0) == []
+    assert list(link.submaps()) == []
+    assert link.counts.refused
+
+
+def test_who_lacks_the_key_is_not_heard():
+    ours = AcousticLink(LinkConfig(number=1, key="secret"), "auv_1")
+    stranger = AcousticLink(LinkConfig(number=2), "auv_2")
+    ours.receive(stranger.next_packet(0.0), 0.0)
+    assert ours.name_of(2) is None
+    assert sum(ours.counts.refused.values()) == 1
+
+
+def test_a_second_vehicle_of_one_name_is_not_believed():
+    link = AcousticLink(LinkConfig(number=1), "auv_1")
+    for number in (2, 3):
+        other = AcousticLink(LinkConfig(number=number), "auv_2")
+        link.receive(other.next_packet(0.0), 0.0)
+    assert (link.name_of(2), link.name_of(3)) == ("auv_2", None)
+    assert sum(link.counts.refused.values()) == 1
+
+
+def test_a_submap_of_another_vehicle_is_refused_by_name():
+    link = AcousticLink(LinkConfig(number=1), "auv_1")
+    with pytest.raises(InvalidInputError, match=r"'auv_2' on the link of 'auv_1'"):
+        link.add_submap(own_submap(2, 0))
+
+
+def test_packets_keep_to_the_size_and_six_bytes_are_overhead():
+    assert OVERHEAD_BYTES <= 6
+    talk = fleet(packet_bytes=48, loss=0.3)
+    talk.until_all_know(6, 500.0)
+    assert max(len(data) for _, _, data in talk.packets) <= 48
+
+
+def test_many_vehicles_fit_their_reports_into_small_packets():
+    talk = Talk(num=12, packet_bytes=32, bit_rate=5000.0, guard_s=0.8)
+    for number in talk.links:
+        talk.add(own_submap(number, 0))
+    talk.until_all_know(12, 900.0)
+    assert max(len(data) for _, _, data in talk.packets) <= 32

@@ -1,0 +1,417 @@
+"""One vehicle's end of an acoustic link: submaps in, packets out; packets in, submaps out.
+
+Sans-IO: the caller has the modem and the time. Nothing depends on what other clocks say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.link.codec import Layer, LayeredSubmap, encode_submap, read_outline
+from uw_dslam_ros2.core.link.fields import ByteReader
+from uw_dslam_ros2.core.link.inbox import Inbox
+from uw_dslam_ros2.core.link.items import (
+    Ask,
+    ItemKind,
+    LayerKey,
+    PeerReport,
+    Status,
+    hello_item,
+    layer_item,
+    read_hello,
+    read_item,
+    read_layer,
+    read_note,
+)
+from uw_dslam_ros2.core.link.outbox import Outbox, OutItem
+from uw_dslam_ros2.core.link.packets import OVERHEAD_BYTES, Packet, bundled, unbundled
+from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState
+from uw_dslam_ros2.core.submap import Submap
+
+__all__ = ["AcousticLink"]
+
+_OUTLINE_RANK, _CELLS_RANK, _ANSWER_RANK, _MOVED_RANK, _DETAIL_RANK = 0.0, 1.0, 1.5, 1.8, 2.0
+_NEWS_PER_STATUS = 10  # fragments after which the others are told what has come
+_MAX_ASKS = 4
+
+
+class AcousticLink:
+    """A vehicle's end of the link.
+
+    Parameters
+    ----------
+    config
+        Settings.
+    name
+        The vehicle_id, told to the others.
+    epoch
+        0 to 3; another one than before, if what was sent before is forgotten.
+    """
+
+    def __init__(self, config: LinkConfig, name: str, epoch: int = 0) -> None:
+        self._config, self._key = config, config.key.encode()
+        self._name, self._epoch = name, epoch % 4
+        self.counts = LinkCounts()
+        self._outbox = Outbox()
+        self._own: dict[LayerKey, OutItem] = {}
+        self._layers: dict[tuple[int, int], dict[Layer, bytes]] = {}
+        self._inboxes: dict[int, Inbox] = {}
+        self._items: dict[int, dict[int, bytes]] = {}
+        self._names: dict[int, str] = {config.number: name}
+        self._held: dict[tuple[int, int, int], LayeredSubmap] = {}
+        self._waiting: dict[tuple[int, LayerKey], bytes] = {}  # finer layers that came too early
+        self._given: dict[tuple[int, int, int], int] = {}  # revision of the submap given out
+        self._asks: dict[tuple[int, LayerKey], None] = {}
+        self._answers: list[bytes] = []
+        self._heard_s: dict[int, float] = {}
+        self._news, self._last_status_s, self._num_reports = 0, -1e9, 0
+        self._was_status = self._is_curious = False
+        self._outbox.add(hello_item(name), _OUTLINE_RANK, "hello")
+
+    # --- own submaps -------------------------------------------------------------------------
+
+    def add_submap(self, submap: Submap) -> list[Submap]:
+        """Take a submap of this vehicle; returns it as the others will have it, if it is new."""
+        if submap.vehicle_id != self._name:
+            raise InvalidInputError(
+                f"submap of {submap.vehicle_id!r} on the link of {self._name!r}"
+            )
+        layers = encode_submap(submap, self._key)
+        self._layers[submap.run_id & 0xFFFF, submap.sequence] = layers
+        for layer in (Layer.OUTLINE, Layer.COARSE):
+            self._say(LayerKey.of(submap.run_id, submap.sequence, layer), layers[layer])
+        self._rank_cells()
+        return self._improved(self._config.number)
+
+    def ask(self, sender: int, key: LayerKey) -> list[Submap]:
+        """Want a finer layer of a submap; of an own one it is sent, for others need it then."""
+        if sender == self._config.number:
+            self._offer(key)
+            return self._improved(sender)
+        self._asks[sender, key] = None
+        self._is_curious = True
+        return []
+
+    def add_answer(self, answer: bytes) -> None:
+        """Tell the others the answer to a question; see `answers`."""
+        content = bytes([ItemKind.ANSWER]) + answer
+        if all(item.content != content for item in self._outbox.items):
+            self._outbox.add(content, _ANSWER_RANK, "answers")
+
+    def take_answers(self) -> list[bytes]:
+        """Answers that have come since the last call."""
+        taken, self._answers = self._answers, []
+        return taken
+
+    def outlines(self) -> dict[tuple[int, int, int], LayeredSubmap]:
+        """What is known of all submaps, by sender, run (16 bits) and sequence."""
+        return dict(self._held)
+
+    def name_of(self, sender: int) -> str | None:
+        """The vehicle with that number; None while it is not known."""
+        return self._names.get(sender)
+
+    def _say(self, key: LayerKey, data: bytes) -> None:
+        item, content = self._own.get(key), layer_item(key, data)
+        self._take_layer(self._config.number, key, data)
+        if item is None:
+            rank = {Layer.OUTLINE: _OUTLINE_RANK, Layer.COARSE: _CELLS_RANK}
+            label = key.layer.name.lower()
+            added = self._outbox.add(content, rank.get(key.layer, _DETAIL_RANK), label)
+            self._own[key] = added
+        elif item.content != content:
+            self._own[key] = self._outbox.replace(item, content)
+            if self._own[key] is not item:  # the others have it where it was: that will do first
+                self._own[key].rank = _MOVED_RANK
+
+    def _rank_cells(self) -> None:
+        """Own cells that look most like what others have seen go first: they may join."""
+        others = [h.outline for w, h in self._held.items() if w[0] != self._config.number]
+        for key, item in self._own.items():
+            outline = self._held[self._config.number, key.run, key.sequence].outline
+            if key.layer is not Layer.COARSE or outline is None:
+                continue
+            likeness = [outline.likeness(other) for other in others if other is not None]
+            item.rank = _CELLS_RANK + 0.4 / (1.0 + 0.1 * max(likeness, default=0.0))
+
+    def _offer(self, key: LayerKey) -> None:
+        """Send a finer layer, and those below it."""
+        layers = self._layers.get((key.run, key.sequence), {})
+        for layer in Layer:
+            if layer in layers and layer <= key.layer:
+                self._say(LayerKey(key.run, key.sequence, layer), layers[layer])
+
+    # --- packets out -------------------------------------------------------------------------
+
+    def next_packet(self, now_s: float) -> bytes | None:
+        """What to send now; None where there is nothing worth a packet."""
+        peers = self._peers(now_s)
+        item = self._outbox.next_item(peers)
+        notes: list[bytes] = []
+        if self._is_status_due(now_s, item is None):
+            notes = self._report(now_s, peers)
+        while note := self._outbox.take_whole(self._room - len(bundled(notes)), peers):
+            notes.append(note)
+        if not notes:
+            if item is None:
+                return None
+            packet = self._outbox.cut(
+                item, self._config.packet_bytes, self._config.number, self._epoch, self._key
+            )
+            label = item.label
+        else:
+            packet = self._bundle(notes)
+            label = "mixed"
+            if all(note[0] != ItemKind.WHOLE for note in notes):
+                label = "status"
+            elif len(notes) == 1 and item is not None:
+                label = item.label
+        self._was_status = label == "status"
+        self.counts.repairs = self._outbox.num_repairs
+        counts = self.counts
+        counts.sent_packets[label] = counts.sent_packets.get(label, 0) + 1
+        counts.sent_bytes[label] = counts.sent_bytes.get(label, 0) + len(packet)
+        return packet
+
+    def num_open(self, now_s: float) -> int:
+        """Own items that somebody lacks, or that were not sent yet."""
+        return self._outbox.num_open(self._peers(now_s))
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all that the others are known to have said is here."""
+        return all(inbox.is_complete for inbox in self._inboxes.values())
+
+    @property
+    def loss(self) -> float:
+        """Share of own packets that do not arrive, by the others' reports."""
+        return self._outbox.loss
+
+    def age_s(self, sender: int, now_s: float) -> float | None:
+        """Time since a vehicle was heard; None where it never was."""
+        heard_s = self._heard_s.get(sender)
+        return None if heard_s is None else now_s - heard_s
+
+    def _peers(self, now_s: float) -> list[int]:
+        silent_s = self._config.silent_s
+        return [peer for peer, heard_s in self._heard_s.items() if now_s - heard_s <= silent_s]
+
+    def _is_status_due(self, now_s: float, is_idle: bool) -> bool:
+        since_s, wait_s = now_s - self._last_status_s, self._config.status_s
+        if self._was_status and not is_idle:
+            return False  # where turns are rare they are not spent on reports alone
+        if self._is_curious or (
+            self._news and (self._news >= _NEWS_PER_STATUS or since_s >= wait_s)
+        ):
+            return True
+        # A report, or a question, may have been lost.
+        if (self._asks or not self.is_complete) and since_s >= 3.0 * wait_s:
+            return True
+        return is_idle and since_s >= self._config.heartbeat_s
+
+    @property
+    def _room(self) -> int:
+        return self._config.packet_bytes - OVERHEAD_BYTES
+
+    def _bundle(self, notes: list[bytes]) -> bytes:
+        return Packet(self._epoch, self._config.number, 0, 0, 0, bundled(notes)).pack(self._key)
+
+    def _status(self, peers: list[int]) -> Status:
+        # Another one first each time: there may not be room for all.
+        self._num_reports += 1
+        senders = sorted(self._inboxes)
+        first = self._num_reports % max(1, len(senders))
+        reports = {s: self._inboxes[s].report() for s in senders[first:] + senders[:first]}
+        return Status(len(self._outbox.items), self._outbox.voids(peers)[:8], reports)
+
+    def _report(self, now_s: float, peers: list[int]) -> list[bytes]:
+        """What has come, and what is wanted, as notes."""
+        self._news, self._last_status_s, self._is_curious = 0, now_s, False
+        status = self._status(peers)
+        while len(bundled([status.pack()])) > self._room:
+            status = _shortened(status)
+        notes = [status.pack()]
+        for sender, key in list(self._asks)[:_MAX_ASKS]:
+            note = Ask(sender, key).pack()
+            if len(bundled([*notes, note])) <= self._room:
+                notes.append(note)
+        return notes
+
+    # --- packets in --------------------------------------------------------------------------
+
+    def receive(self, data: bytes, now_s: float) -> list[Submap]:
+        """Take a packet; returns submaps, of any vehicle, that are new or have changed by it.
+
+        What is damaged, of another version or without the fleet's key is counted and dropped.
+        """
+        try:
+            packet = Packet.unpack(data, self._key)
+            if packet.sender == self._config.number:
+                raise InvalidInputError(f"packet of sender {packet.sender}, which is this vehicle")
+        except InvalidInputError as error:
+            self._refuse(error)
+            return []
+        self.counts.received_packets += 1
+        self.counts.received_bytes += len(data)
+        sender = packet.sender
+        self._heard_s[sender] = now_s
+        inbox = self._inboxes.get(sender)
+        if inbox is None or inbox.epoch != packet.epoch:
+            inbox = self._inboxes[sender] = Inbox(packet.epoch)
+            self._items[sender] = {}
+            self._outbox.forget(sender)
+        before = inbox.num_duplicates
+        try:
+            if packet.num_needed == 0:
+                for note in unbundled(packet.payload):
+                    self._take_note(sender, inbox, note)
+            else:
+                self._take_found(sender, inbox, inbox.add(packet))
+        except InvalidInputError as error:
+            self._refuse(error)
+        self.counts.duplicates += inbox.num_duplicates - before
+        return [submap for one in {sender, self._config.number} for submap in self._improved(one)]
+
+    def _refuse(self, error: InvalidInputError) -> None:
+        reason = " ".join(str(error).split()[:3])
+        self.counts.refused[reason] = self.counts.refused.get(reason, 0) + 1
+
+    def _take_note(self, sender: int, inbox: Inbox, note: bytes) -> None:
+        said = read_note(note)
+        if isinstance(said, bytes):
+            self._take_found(sender, inbox, inbox.add_whole(said))
+        elif isinstance(said, Status):
+            inbox.expect(said.num_items, said.voids)
+            report = said.peers.get(self._config.number)
+            if report is None and said.is_cut:
+                return
+            if report is None or report.epoch != self._epoch:
+                report = PeerReport(self._epoch, 0)
+            self._outbox.hear(sender, report)
+        elif said.sender == self._config.number:
+            self._offer(said.key)
+
+    def _take_found(self, sender: int, inbox: Inbox, found: tuple[int, bytes] | None) -> None:
+        self._news += 1
+        if found is not None:
+            number, item = found
+            self._take_item(sender, item)
+            inbox.finish(number)
+            self._items[sender][number] = item
+
+    def _take_item(self, sender: int, item: bytes) -> None:
+        kind, body = read_item(item)
+        if kind is ItemKind.HELLO:
+            self._take_name(sender, body)
+        elif kind is ItemKind.LAYER:
+            key, data = read_layer(body)
+            self._take_layer(sender, key, data)
+        elif kind is ItemKind.ANSWER:
+            self._answers.append(body.rest)
+        else:
+            raise InvalidInputError(f"an item of kind {kind.name}, expected one to keep")
+
+    def _take_name(self, sender: int, body: ByteReader) -> None:
+        name = read_hello(body)
+        known = self._names.get(sender)
+        if known == name:
+            return
+        if known is not None or name in self._names.values():
+            # No damage, so that sending it again would not help.
+            self._refuse(InvalidInputError(f"two vehicles are {name!r} or number {sender}"))
+            return
+        self._names[sender] = name
+
+    def _take_layer(self, sender: int, key: LayerKey, data: bytes) -> None:
+        if key.layer is Layer.OUTLINE:
+            outline = read_outline(data, self._key)
+            if LayerKey.of(outline.run_id, outline.sequence, key.layer) != key:
+                raise InvalidInputError(f"outline of submap {outline.sequence} came as {key}")
+        where = (sender, key.run, key.sequence)
+        held = self._held.get(where) or LayeredSubmap(self._key)
+        below = -1 if held.cells is None else int(held.cells.layer)
+        if key.layer > Layer.COARSE and below < key.layer - 1:
+            self._waiting[sender, key] = data
+            return
+        if held.add(data) is not key.layer:
+            raise InvalidInputError(f"a layer came as {key.layer.name}, which it is not")
+        self._held[where] = held
+        if key.layer is Layer.OUTLINE and sender != self._config.number:
+            self._rank_cells()
+        self._asks.pop((sender, key), None)
+        finer = LayerKey(key.run, key.sequence, Layer(min(key.layer + 1, Layer.FINE)))
+        if key.layer is not Layer.OUTLINE and (early := self._waiting.pop((sender, finer), None)):
+            self._take_layer(sender, finer, early)
+
+    def _improved(self, sender: int) -> list[Submap]:
+        """Submaps of a vehicle as they are now, if they were not given out like that before."""
+        name = self._names.get(sender)
+        if name is None:
+            return []
+        found = []
+        for where in sorted(key for key in self._held if key[0] == sender):
+            revision = self._held[where].revision
+            if revision is not None and revision > self._given.get(where, -1):
+                submap = self._held[where].submap(name)
+                assert submap is not None, "it has a revision"
+                self._given[where] = revision
+                found.append(submap)
+        return found
+
+    # --- restarts ----------------------------------------------------------------------------
+
+    def to_state(self) -> LinkState:
+        """Everything that was received, and what was said."""
+        return LinkState(
+            self._epoch,
+            tuple(
+                (i.content, i.rank, i.label, i.parts, i.num_sent, i.is_void)
+                for i in self._outbox.items
+            ),
+            {
+                sender: (inbox.epoch, tuple(sorted(self._items[sender].items())))
+                for sender, inbox in self._inboxes.items()
+            },
+        )
+
+    @classmethod
+    def from_state(cls, config: LinkConfig, name: str, state: LinkState) -> AcousticLink:
+        """Go on; `submaps` gives all that is known, and what the others lack they will say."""
+        link = cls(config, name, state.epoch)
+        link._outbox.items.clear()
+        for content, rank, label, parts, num_sent, is_void in state.own:
+            item = link._outbox.add(content, rank, label)
+            item.parts, item.num_sent, item.is_void = parts, num_sent, is_void
+            kind, body = read_item(content)
+            if kind is ItemKind.LAYER:
+                key, data = read_layer(body)
+                link._own[key] = item
+                link._take_layer(config.number, key, data)
+                link._layers.setdefault((key.run, key.sequence), {})[key.layer] = data
+        for sender, (epoch, items) in state.received.items():
+            inbox = link._inboxes[sender] = Inbox(epoch)
+            link._items[sender] = dict(items)
+            for number, item_content in items:
+                link._take_item(sender, item_content)
+                inbox.finish(number)
+        return link
+
+    def submaps(self) -> Iterator[Submap]:
+        """All submaps that can be drawn, of all vehicles whose names are known."""
+        for (sender, _, _), held in sorted(self._held.items()):
+            name = self._names.get(sender)
+            submap = None if name is None else held.submap(name)
+            if submap is not None:
+                yield submap
+
+
+def _shortened(status: Status) -> Status:
+    """With a little less about the one of whom most is said."""
+    longest = max(status.peers, key=lambda sender: len(status.peers[sender].lacking), default=None)
+    if longest is None or not status.peers[longest].lacking:
+        fewer = dict(list(status.peers.items())[:-1])
+        return Status(status.num_items, status.voids[:-1], fewer, bool(status.peers))
+    report = status.peers[longest]
+    short = PeerReport(report.epoch, report.base, report.lacking[:-1], True)
+    return Status(status.num_items, status.voids, status.peers | {longest: short}, status.is_cut)

@@ -1,0 +1,66 @@
+"""Settings, counts and memory of a link."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from uw_dslam_ros2.core.config import Config, setting
+from uw_dslam_ros2.core.link.packets import MAX_PACKET_BYTES, MAX_SENDERS, MIN_PACKET_BYTES
+
+__all__ = ["LinkConfig", "LinkCounts", "LinkState"]
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfig(Config):
+    """How a vehicle speaks."""
+
+    number: int = setting(
+        1, 0, MAX_SENDERS - 1, "the vehicle's number on the link; no two share one", is_basic=True
+    )
+    packet_bytes: int = setting(
+        64,
+        MIN_PACKET_BYTES,
+        MAX_PACKET_BYTES,
+        "largest packet of the modem [bytes]",
+        is_basic=True,
+    )
+    key: str = setting(
+        "", doc="secret of the fleet: packets that were made without it are refused", is_basic=True
+    )
+    status_s: float = setting(
+        10.0,
+        0.1,
+        3600.0,
+        "what has come is told at most this often, but for every ten packets [s]",
+    )
+    heartbeat_s: float = setting(
+        60.0, 1.0, 36000.0, "a vehicle that has nothing to say says so this often [s]"
+    )
+    silent_s: float = setting(
+        300.0, 1.0, 1e6, "for a vehicle not heard for so long nothing is repeated [s]"
+    )
+
+
+@dataclass(slots=True)
+class LinkCounts:
+    """What went over the link so far."""
+
+    sent_packets: dict[str, int] = field(default_factory=dict)
+    sent_bytes: dict[str, int] = field(default_factory=dict)
+    received_packets: int = 0
+    received_bytes: int = 0
+    duplicates: int = 0
+    repairs: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+    """Packets and items that were not taken, by the reason's first words."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkState:
+    """What must outlive a restart."""
+
+    epoch: int
+    own: tuple[tuple[bytes, float, str, int, int, bool], ...]
+    """Content, rank, label, parts, fragments sent, and whether it is void, of each item."""
+    received: dict[int, tuple[int, tuple[tuple[int, bytes], ...]]]
+    """Of each sender: its epoch, and numbers and content of what has come."""
