@@ -7,12 +7,12 @@ DVL says, if all are read rightly. Of two readings that fit equally well neither
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.doctor.alone import judge_imu, without_zeros
+from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.fits import (
     TurnFit,
     VelocityFit,
@@ -25,7 +25,7 @@ from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
 from uw_dslam_ros2.core.findings import Finding
 
-__all__ = ["Examination", "examine"]
+__all__ = ["examine"]
 
 FloatArray = NDArray[np.float64]
 
@@ -43,29 +43,6 @@ _UNITS = {
     "millimetres per second": 1e-3, "centimetres per second": 1e-2, "knots": 0.5144,
     "kilometres per hour": 1.0 / 3.6,
 }  # fmt: skip
-_SWING_RAD = math.radians(8.6)
-_ZEROS_IN_A_ROW = 3
-_MOVES_M_S = 0.15
-_LEAST_DISTINCT = 0.05  # of measured velocities; of commanded ones a few in a thousand are
-
-
-@dataclass(slots=True)
-class Examination:
-    """What was found, surest cause first, and the conventions that mend it."""
-
-    findings: list[Finding] = field(default_factory=list)
-    conventions: Conventions = field(default_factory=Conventions)
-    num_ping_motions: int = 0
-    num_turning_windows: int = 0
-    mended: set[str] = field(default_factory=set)
-    """Kinds of findings that the conventions mend."""
-
-    def add(self, finding: Finding, **changes: str | float | bool) -> None:
-        """Name a cause, and what to change."""
-        self.findings.append(finding)
-        if changes:
-            self.mended.add(finding.kind)
-        self.conventions = Conventions(**(self.conventions.to_dict() | changes))
 
 
 def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "") -> Examination:
@@ -77,103 +54,13 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
     if len(navigation.imu_s) < _MIN_READINGS:
         return result
     imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
-    _judge_imu(result, imu, vehicle_id)
-    navigation = _without_zeros(result, navigation, vehicle_id)
+    judge_imu(result, imu, vehicle_id)
+    navigation = without_zeros(result, navigation, vehicle_id)
     motions = ping_motions(pings, 0.7, 2.1)
     result.num_ping_motions = len(motions)
     if len(motions) >= _MIN_MOTIONS:
         _Trial(result, navigation, imu, motions, pings, vehicle_id).run()
     return result
-
-
-def _judge_imu(result: Examination, imu: ImuState, vehicle_id: str) -> None:
-    if imu.is_orientation_constant:
-        assert imu.by_rates is not None
-        turned = math.degrees(float(np.ptp(imu.by_rates)))
-        result.add(
-            Finding(
-                "imu_no_orientation",
-                "imu",
-                f"its orientation never changes while its rates turn by {turned:.0f} degrees: the "
-                "driver does not fill it; use only the rates (conventions.imu_orientation: none)",
-                vehicle_id=vehicle_id,
-            ),
-            imu_orientation="none",
-        )
-    if imu.are_rates_zero:
-        result.add(
-            Finding(
-                "imu_no_rates",
-                "imu",
-                "its rates are all zero while its orientation turns: the driver does not fill "
-                "them; use only the orientation (conventions.imu_rates: none)",
-                vehicle_id=vehicle_id,
-            ),
-            imu_rates="none",
-        )
-    if 40.0 < abs(imu.ratio) < 80.0:
-        result.add(
-            Finding(
-                "imu_rates_in_degrees",
-                "imu",
-                f"its rates are {abs(imu.ratio):.1f} times too fast for its orientation: they are "
-                "in degrees per second (conventions.imu_rates_in_degrees: true)",
-                vehicle_id=vehicle_id,
-            ),
-            imu_rates_in_degrees=True,
-        )
-    if imu.swing_rad > _SWING_RAD:
-        result.add(
-            Finding(
-                "heading_disturbed",
-                "imu",
-                f"its heading swings by {math.degrees(imu.swing_rad):.0f} degrees against its "
-                "rates, as near steel; calibrate the compass, or use only the rates "
-                "(conventions.imu_orientation: none)",
-                vehicle_id=vehicle_id,
-            ),
-            imu_orientation="none",
-        )
-
-
-def _without_zeros(
-    result: Examination, navigation: NavigationSample, vehicle_id: str
-) -> NavigationSample:
-    """Tell of runs of exact zeros between velocities that are far from zero, and drop them.
-
-    Velocities that were commanded, not measured, repeat a few values: their zeros are stops.
-    """
-    velocity = navigation.velocity_m_s
-    is_zero = ~velocity.any(axis=1)
-    moving = velocity[~is_zero]
-    if len(np.unique(moving, axis=0)) < _LEAST_DISTINCT * len(moving):
-        return navigation
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_zero, [False]]).astype(int)))
-    num_false, longest_s = 0, 0.0
-    for begin, end in edges.reshape(-1, 2):
-        around = [velocity[i] for i in (begin - 1, end) if 0 <= i < len(velocity)]
-        speeds = [float(np.hypot(*v)) for v in around]
-        if end - begin >= _ZEROS_IN_A_ROW and speeds and max(speeds) > _MOVES_M_S:
-            num_false += int(end - begin)
-            last = min(end, len(velocity) - 1)
-            seconds = float(navigation.velocity_s[last] - navigation.velocity_s[begin])
-            longest_s = max(longest_s, seconds)
-    if num_false == 0:
-        return navigation
-    result.add(
-        Finding(
-            "dvl_zero_without_lock",
-            "velocity",
-            f"{num_false} velocities are exactly zero, up to {longest_s:.0f} s on end, while the "
-            "vehicle moves before and after: the dvl had no bottom lock "
-            "(conventions.velocity_zero_is_invalid: true)",
-            vehicle_id=vehicle_id,
-        ),
-        velocity_zero_is_invalid=True,
-    )
-    return replace(
-        navigation, velocity_s=navigation.velocity_s[~is_zero], velocity_m_s=velocity[~is_zero]
-    )
 
 
 class _Trial:

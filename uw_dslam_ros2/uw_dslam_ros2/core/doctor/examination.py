@@ -1,0 +1,29 @@
+"""What the doctor found of one vehicle, and what mends it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.findings import Finding
+
+__all__ = ["Examination"]
+
+
+@dataclass(slots=True)
+class Examination:
+    """What was found, surest cause first, and the conventions that mend it."""
+
+    findings: list[Finding] = field(default_factory=list)
+    conventions: Conventions = field(default_factory=Conventions)
+    num_ping_motions: int = 0
+    num_turning_windows: int = 0
+    mended: set[str] = field(default_factory=set)
+    """Kinds of findings that the conventions mend."""
+
+    def add(self, finding: Finding, **changes: str | float | bool) -> None:
+        """Name a cause, and what to change."""
+        self.findings.append(finding)
+        if changes:
+            self.mended.add(finding.kind)
+        self.conventions = Conventions(**(self.conventions.to_dict() | changes))
