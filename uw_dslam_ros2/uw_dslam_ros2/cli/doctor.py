@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,8 @@ class Diagnosis:
     findings: tuple[Finding, ...]
     conventions: Conventions
     num_ping_motions: int
+    sonar_changes: Mapping[str, str]
+    pixels: str
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -147,6 +149,8 @@ def _diagnose(
         tuple(findings),
         examined.conventions,
         examined.num_ping_motions,
+        examined.sonar_changes,
+        examined.pixels,
     )
 
 
@@ -181,10 +185,13 @@ def _print(diagnosis: Diagnosis) -> None:
 def _settings(diagnoses: Sequence[Diagnosis]) -> str:
     content: dict[str, Any] = {}
     for diagnosis in diagnoses:
+        parameters: dict[str, Any] = {}
         if changes := diagnosis.conventions.changes():
-            content[f"/{diagnosis.vehicle_id}/sonar_mapper"] = {
-                "ros__parameters": {"conventions": changes}
-            }
+            parameters["conventions"] = changes
+        if diagnosis.sonar_changes:
+            parameters["mapper"] = {"sonar": dict(diagnosis.sonar_changes)}
+        if parameters:
+            content[f"/{diagnosis.vehicle_id}/sonar_mapper"] = {"ros__parameters": parameters}
     head = "# What mends this recording; nothing, if this is all.\n"
     return head + (yaml.safe_dump(content, sort_keys=True) if content else "")
 
@@ -198,6 +205,7 @@ def _report(diagnoses: Sequence[Diagnosis], findings: Sequence[Finding]) -> dict
                 "streams": [dataclasses.asdict(stream) for stream in d.streams],
                 "conventions": d.conventions.to_dict(),
                 "num_ping_motions": d.num_ping_motions,
+                "pixels": d.pixels,
             }
             for d in diagnoses
         ],

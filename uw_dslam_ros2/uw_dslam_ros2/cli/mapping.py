@@ -168,7 +168,6 @@ def map_recording(
         found = health_findings(MappedVehicle(recording.vehicle_id, present, {}))
         return VehicleSubmaps(recording.vehicle_id, (), {}, tuple(found))
     run_ids = itertools.count(1)
-    runs = VehicleRuns(config, recording.vehicle_id, lambda: next(run_ids))
     newest: dict[SubmapId, Submap] = {}
     number = 0
     has_yaw = has_yaw_rate = False
@@ -177,8 +176,10 @@ def map_recording(
         findings = reader.check_clocks()
         mountings = mountings_of(recording, sensors, reader.transforms())
         examined = examine_recording(recording, sensors, config.sonar, reader.stamps, mountings.of)
-        reader.conventions, said = mended(examined, sensors.conventions)
+        reader.conventions, sonar, said = mended(examined, sensors.conventions, config.sonar)
         findings += said
+        config = dataclasses.replace(config, sonar=sonar)
+        runs = VehicleRuns(config, recording.vehicle_id, lambda: next(run_ids))
         for number, event in enumerate(in_stamp_order(reader.events()), start=1):
             if number % 200 == 0:
                 _count(200)

@@ -129,17 +129,23 @@ def _is_axis_open(event: Reading, T_base_sensor: NDArray[np.float64]) -> bool:
     return isinstance(event, VelocityEvent) and not event.is_z_down and T_base_sensor[2, 2] < 0.0
 
 
-def mended(examined: Examination, known: Conventions) -> tuple[Conventions, list[Finding]]:
-    """Conventions to read a recording by, and what to tell of it.
+def mended(
+    examined: Examination, known: Conventions, sonar: SonarConfig
+) -> tuple[Conventions, SonarConfig, list[Finding]]:
+    """Conventions and a sonar's front end to read a recording by, and what to tell of it.
 
     What was found is used at once, where the settings say nothing of conventions.
     """
     if known != Conventions():
-        return known, list(examined.findings)
+        return known, sonar, list(examined.findings)
     findings = [
         replace(finding, detail=f"{finding.detail}; it is mapped so")
         if finding.kind in examined.mended
         else finding
         for finding in examined.findings
     ]
-    return examined.conventions, findings
+    return (
+        examined.conventions,
+        SonarConfig(**(sonar.to_dict() | examined.sonar_changes)),
+        findings,
+    )

@@ -57,6 +57,21 @@ def judge_imu(result: Examination, imu: ImuState, vehicle_id: str) -> None:
             ),
             imu_rates_in_degrees=True,
         )
+    if imu.orientation_delay_s:
+        late_s = imu.orientation_delay_s
+        result.add(
+            Finding(
+                "heading_delay",
+                "imu",
+                f"its orientation turns {abs(late_s):.2f} s "
+                f"{'later' if late_s > 0.0 else 'earlier'} than its own rates, as behind a slow "
+                "filter; use only the orientation, at its own time (conventions.imu_rates: none"
+                + (f", conventions.imu_delay_s: {late_s:.2f})" if late_s > 0.0 else ")"),
+                vehicle_id=vehicle_id,
+            ),
+            imu_rates="none",
+            imu_delay_s=round(max(0.0, late_s), 3),
+        )
     if imu.swing_rad > _SWING_RAD:
         result.add(
             Finding(

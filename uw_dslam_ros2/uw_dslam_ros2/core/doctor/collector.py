@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
+from uw_dslam_ros2.core.doctor.speckle import patch_variations, quantity_of
 from uw_dslam_ros2.core.doctor.turning import BeamSample
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
@@ -28,6 +29,8 @@ __all__ = ["SampleCollector"]
 
 FloatArray = NDArray[np.float64]
 
+_NUM_SPECKLE_IMAGES = 20
+
 
 class SampleCollector:
     """Has the inputs of a `VehicleMapper`, so that `io.feeding.feed` serves both alike.
@@ -43,6 +46,7 @@ class SampleCollector:
         self._pings: list[tuple[int, FloatArray]] = []
         self._beams: list[tuple[Beams, SE2, FloatArray | None]] = []
         self._T_base_sonar = SE2()
+        self._variations: list[FloatArray] = []
 
     @property
     def start_ns(self) -> int:
@@ -107,6 +111,8 @@ class SampleCollector:
         """As a mapper's."""
         if is_few_beams(image):
             return self.add_beams(beams_of_image(image), T_base_sonar, projection)
+        if len(self._variations) < _NUM_SPECKLE_IMAGES:
+            self._variations.append(patch_variations(image.intensity))
         return self._add(detect(image, self._sonar), T_base_sonar, projection)
 
     def add_scan(
@@ -162,6 +168,8 @@ class SampleCollector:
             self.seconds([stamp_ns for stamp_ns, _ in pings]),
             tuple(points for _, points in pings),
             self._T_base_sonar,
+            quantity_of(self._variations),
+            self._sonar.intensity,
         )
 
     @property

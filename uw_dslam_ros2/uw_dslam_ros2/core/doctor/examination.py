@@ -19,7 +19,11 @@ class Examination:
     num_ping_motions: int = 0
     num_turning_windows: int = 0
     mended: set[str] = field(default_factory=set)
-    """Kinds of findings that the conventions mend."""
+    """Kinds of findings that the conventions or the front end's settings mend."""
+    sonar_changes: dict[str, str] = field(default_factory=dict)
+    """Settings of the sonar's front end (`SonarConfig`) that mend what was found."""
+    pixels: str = ""
+    """What the sonar's images hold: compressed, amplitude or power; "" where it cannot be told."""
 
     def add(self, finding: Finding, **changes: str | float | bool) -> None:
         """Name a cause, and what to change."""

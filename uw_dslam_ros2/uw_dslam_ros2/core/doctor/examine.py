@@ -7,11 +7,13 @@ DVL says, if all are read rightly. Of two readings that fit equally well neither
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.alone import judge_imu, without_zeros
+from uw_dslam_ros2.core.doctor.delays import Delays, find_delays
 from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.fits import (
     TurnFit,
@@ -33,7 +35,6 @@ _SURE = 0.99
 _MIN_MOTIONS = 15
 _MIN_READINGS = 20
 _MAX_TURN_COST = 1.5
-_MIN_DELAY_S = 0.08
 _MIN_OFFSET_RAD = math.radians(4.0)
 _MIN_SCALE_ERROR = 0.019
 _USUAL_SCALE_ERROR = 0.015
@@ -50,7 +51,9 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
 
     `pings` are bursts: each but the last of a burst has another about a second later.
     """
-    result = Examination()
+    result = Examination(pixels=pings.pixels or "")
+    if pings.pixels == "power" and pings.pixels_read_as == "amplitude":
+        _say_power(result, vehicle_id)
     if len(navigation.imu_s) < _MIN_READINGS:
         return result
     imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
@@ -61,6 +64,29 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
     if len(motions) >= _MIN_MOTIONS:
         _Trial(result, navigation, imu, motions, pings, vehicle_id).run()
     return result
+
+
+def _say_power(result: Examination, vehicle_id: str) -> None:
+    result.add(
+        Finding(
+            "sonar_power",
+            "sonar",
+            "its pixels vary as an echo's power does, not its amplitude: read as amplitude they "
+            "give many false echoes (mapper.sonar.intensity: power)",
+            vehicle_id=vehicle_id,
+        )
+    )
+    result.mended.add("sonar_power")
+    result.sonar_changes["intensity"] = "power"
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """One way to read the sensors."""
+
+    yaw_sign: int = 1
+    is_sonar_mirrored: bool = False
+    is_velocity_mirrored: bool = False
 
 
 class _Trial:
@@ -81,6 +107,9 @@ class _Trial:
         self._motions = motions
         self._mount = pings.T_base_sonar
         self._vehicle_id = vehicle_id
+        self._yaw: FloatArray | None = None
+        self._delay_s = 0.0
+        self._side_confidence = 1.0
 
     def run(self) -> None:
         imu, imu_s = self._imu, self._navigation.imu_s
@@ -94,34 +123,46 @@ class _Trial:
         fits = rates or orientation
         if fits is None:
             return
-        yaw = by_rates if rates else imu.by_orientation
-        assert yaw is not None
+        self._yaw = by_rates if rates else imu.by_orientation
+        self._delay_s = fits[0].delay_s
+        reading: _Reading | None = _Reading(fits[0].sign)
         if rates and orientation and rates[0].sign != orientation[0].sign:
             self._say_one_flipped(rates[0].sign, orientation[0].sign, orientation)
         elif fits[0].sign < 0:
-            self._judge_handedness(yaw, fits)
-        else:
-            self._judge_velocity(self._fit(yaw, fits), self._fit(yaw, fits, velocity=True))
-        self._judge_delay(fits)
+            reading = self._handedness()
+        if reading is None:
+            self._say_delays(find_delays(fits, lambda _: None, _SURE))
+            return
+        if reading == _Reading():
+            reading = self._velocity_side(reading)
+        chosen = reading
+        delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), _SURE)
+        fit = self._fit(chosen, delays.velocity_after_imu_s)
+        if fit is not None and fit.is_mirrored:
+            self._say_velocity_mirrored(fit)
+        self._say_delays(delays)
+        if fit is not None:
+            if not fit.is_mirrored:
+                self._judge_offset(fit)
+            self._judge_scale(fit)
 
     def _believed(self, fits: list[TurnFit]) -> list[TurnFit] | None:
         best, other = fits[0], fits[1]
         is_close = float(np.mean(best.cost)) < _MAX_TURN_COST
         return fits if is_close and confidence_of(best.cost, other.cost) > _SURE else None
 
-    def _fit(
-        self, yaw: FloatArray, fits: list[TurnFit], *, sonar: bool = False, velocity: bool = False
-    ) -> VelocityFit | None:
-        sign = 1 if sonar else fits[0].sign
+    def _fit(self, reading: _Reading, velocity_delay_s: float = 0.0) -> VelocityFit | None:
+        assert self._yaw is not None
         return fit_velocity(
             self._motions,
             self._navigation,
-            sign * yaw,
-            fits[0].delay_s,
+            reading.yaw_sign * self._yaw,
+            self._delay_s,
             sonar=complex(self._mount.x, self._mount.y),
             sonar_yaw_rad=self._mount.yaw,
-            is_sonar_mirrored=sonar,
-            is_velocity_mirrored=velocity,
+            is_sonar_mirrored=reading.is_sonar_mirrored,
+            is_velocity_mirrored=reading.is_velocity_mirrored,
+            velocity_delay_s=velocity_delay_s,
         )
 
     def _add(
@@ -159,9 +200,10 @@ class _Trial:
                 imu_rates="frd",
             )
 
-    def _judge_handedness(self, yaw: FloatArray, fits: list[TurnFit]) -> None:
+    def _handedness(self) -> _Reading | None:
         """Say who is the wrong way round where the echoes turn against the IMU."""
-        sonar, imu = self._fit(yaw, fits, sonar=True), self._fit(yaw, fits)
+        readings = _Reading(1, is_sonar_mirrored=True), _Reading(-1)
+        sonar, imu = (self._fit(reading) for reading in readings)
         sure = 0.5
         if sonar is not None and imu is not None:
             sure = confidence_of(sonar.cost, imu.cost)
@@ -175,8 +217,8 @@ class _Trial:
                 sure,
                 sonar_is_mirrored=True,
             )
-            self._judge_velocity(sonar, None)
-        elif imu is not None and sure < 1.0 - _SURE:
+            return readings[0]
+        if imu is not None and sure < 1.0 - _SURE:
             changes = {"imu_orientation": "ned", "imu_rates": "frd"}
             if self._imu.by_orientation is None:
                 del changes["imu_orientation"]
@@ -191,40 +233,42 @@ class _Trial:
                 1.0 - sure,
                 **changes,
             )
-            self._judge_velocity(imu, None)
-        else:
-            self._add(
-                "handedness",
-                "",
-                "the sonar's echoes turn against the imu, and the dvl cannot tell which of them "
-                "is the wrong way round: try conventions.sonar_is_mirrored: true, or "
-                "conventions.imu_orientation: ned with conventions.imu_rates: frd",
-                0.5,
-            )
+            return readings[1]
+        self._add(
+            "handedness",
+            "",
+            "the sonar's echoes turn against the imu, and the dvl cannot tell which of them "
+            "is the wrong way round: try conventions.sonar_is_mirrored: true, or "
+            "conventions.imu_orientation: ned with conventions.imu_rates: frd",
+            0.5,
+        )
+        return None
 
     # --- the velocity
     # -------------------------------------------------------------------------------------------
 
-    def _judge_velocity(self, fit: VelocityFit | None, mirrored: VelocityFit | None) -> None:
-        if fit is None:
-            return
-        if mirrored is not None and confidence_of(mirrored.cost, fit.cost) > _SURE:
-            offset = mirrored.yaw_rad
-            axes = "exchanged" if abs(abs(mirrored.yaw_rad) - 0.5 * math.pi) < 0.3 else "mirrored"
-            self._add(
-                "dvl_mirrored",
-                "velocity",
-                f"its sideways velocity is against the sonar's echoes: its axes are {axes} "
-                f"(conventions.velocity_is_mirrored: true, conventions.velocity_yaw_offset_rad: "
-                f"{offset:.2f})",
-                confidence_of(mirrored.cost, fit.cost),
-                velocity_is_mirrored=True,
-                velocity_yaw_offset_rad=round(offset, 4) if abs(offset) > _MIN_OFFSET_RAD else 0.0,
-            )
-            fit = mirrored
-        else:
-            self._judge_offset(fit)
-        self._judge_scale(fit)
+    def _velocity_side(self, reading: _Reading) -> _Reading:
+        """The reading, with the velocity's sideways axis the other way where that fits better."""
+        other = replace(reading, is_velocity_mirrored=True)
+        plain, mirrored = self._fit(reading), self._fit(other)
+        if plain is None or mirrored is None:
+            return reading
+        self._side_confidence = confidence_of(mirrored.cost, plain.cost)
+        return other if self._side_confidence > _SURE else reading
+
+    def _say_velocity_mirrored(self, fit: VelocityFit) -> None:
+        offset = fit.yaw_rad
+        axes = "exchanged" if abs(abs(offset) - 0.5 * math.pi) < 0.3 else "mirrored"
+        self._add(
+            "dvl_mirrored",
+            "velocity",
+            f"its sideways velocity is against the sonar's echoes: its axes are {axes} "
+            f"(conventions.velocity_is_mirrored: true, conventions.velocity_yaw_offset_rad: "
+            f"{offset:.2f})",
+            self._side_confidence,
+            velocity_is_mirrored=True,
+            velocity_yaw_offset_rad=round(offset, 4) if abs(offset) > _MIN_OFFSET_RAD else 0.0,
+        )
 
     def _judge_offset(self, fit: VelocityFit) -> None:
         sigma = fit.factor_sigma / max(fit.scale, 1e-9)
@@ -296,20 +340,40 @@ class _Trial:
     # --- time
     # -------------------------------------------------------------------------------------------
 
-    def _judge_delay(self, fits: list[TurnFit]) -> None:
-        best, still = fits[0], fits[2]
-        sure = confidence_of(best.cost, still.cost)
-        if abs(best.delay_s) < _MIN_DELAY_S or sure < _SURE:
-            return
-        way = "later" if best.delay_s > 0.0 else "earlier"
-        self._add(
-            "sonar_delay",
-            "sonar",
-            f"its stamps are {abs(best.delay_s):.2f} s {way} than the imu's, by how both turn "
-            f"(conventions.sonar_delay_s: {best.delay_s:.2f})",
-            sure,
-            sonar_delay_s=round(best.delay_s, 3),
-        )
+    def _say_delays(self, delays: Delays) -> None:
+        either = "" if delays.is_owner_known else "; or it is the {}, which the dvl does not tell"
+        if delays.imu_s:
+            self._add(
+                "imu_delay",
+                "imu",
+                f"its stamps are {_late(delays.imu_s)} than those of sonar and dvl, by how the "
+                f"echoes turn{either.format('sonar')} (conventions.imu_delay_s: "
+                f"{delays.imu_s:.2f})",
+                delays.confidence,
+                imu_delay_s=round(delays.imu_s, 3),
+            )
+        if delays.sonar_s:
+            self._add(
+                "sonar_delay",
+                "sonar",
+                f"its stamps are {_late(delays.sonar_s)} than the imu's, by how both turn"
+                f"{either.format('imu')} (conventions.sonar_delay_s: {delays.sonar_s:.2f})",
+                delays.confidence,
+                sonar_delay_s=round(delays.sonar_s, 3),
+            )
+        if delays.velocity_s:
+            self._add(
+                "velocity_delay",
+                "velocity",
+                f"its stamps are {_late(delays.velocity_s)} than those of sonar and imu, by how "
+                f"the echoes move (conventions.velocity_delay_s: {delays.velocity_s:.2f})",
+                delays.confidence,
+                velocity_delay_s=round(delays.velocity_s, 3),
+            )
+
+
+def _late(delay_s: float) -> str:
+    return f"{abs(delay_s):.2f} s {'later' if delay_s > 0.0 else 'earlier'}"
 
 
 def _confidence_in(value: float, sigma: float) -> float:

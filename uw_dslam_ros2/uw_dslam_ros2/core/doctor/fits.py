@@ -134,6 +134,7 @@ def fit_velocity(
     sonar_yaw_rad: float,
     is_sonar_mirrored: bool = False,
     is_velocity_mirrored: bool = False,
+    velocity_delay_s: float = 0.0,
 ) -> VelocityFit | None:
     """Turn and scale of the velocity that explain how the echoes move; None where too few do.
 
@@ -144,12 +145,14 @@ def fit_velocity(
     sonar : the sonar's place in base_link, x + iy [m]; `sonar_yaw_rad` its direction.
     is_sonar_mirrored : read the echoes with port and starboard exchanged.
     is_velocity_mirrored : read the velocity with its sideways axis the other way.
+    velocity_delay_s : how much later than the IMU's the velocity's stamps are.
     """
     grid = np.arange(navigation.imu_s[0], navigation.imu_s[-1], _STEP_S)
     yaw = at_times(grid, navigation.imu_s, yaw_rad)
+    stamped = grid + velocity_delay_s
     velocity = at_times(
-        grid, navigation.velocity_s, navigation.velocity_m_s[:, 0]
-    ) + 1j * at_times(grid, navigation.velocity_s, navigation.velocity_m_s[:, 1])
+        stamped, navigation.velocity_s, navigation.velocity_m_s[:, 0]
+    ) + 1j * at_times(stamped, navigation.velocity_s, navigation.velocity_m_s[:, 1])
     if is_velocity_mirrored:
         velocity = np.conj(velocity)
     lever = sonar - complex(*navigation.velocity_lever_m)

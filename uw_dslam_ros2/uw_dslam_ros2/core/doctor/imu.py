@@ -18,6 +18,9 @@ _WINDOW_S = 1.5
 _MIN_TURN_RAD = 0.5
 _SWING_S = 30.0
 _GAP_S = 1.0  # over which nobody knows how the vehicle turned
+_MAX_DELAY_S = 2.0
+_MIN_DELAY_S = 0.15  # a filter of its own delays an orientation by up to that
+_ALIKE = 0.03  # one less a correlation
 _DEGREES = 180.0 / math.pi
 
 
@@ -28,6 +31,8 @@ class ImuState:
     ``ratio`` is how many times faster the rates turn than the orientation (-1: the other way;
     57.3: in degrees), NaN where it cannot be told; ``swing_rad`` the largest change within 30 s
     of the orientation against the rates, their constant difference taken off.
+    ``orientation_delay_s`` is how much later than the rates the orientation turned, before it was
+    put in time with them.
     """
 
     by_orientation: FloatArray | None
@@ -36,6 +41,7 @@ class ImuState:
     are_rates_zero: bool
     ratio: float
     swing_rad: float
+    orientation_delay_s: float = 0.0
 
 
 def compare_yaw_and_rate(
@@ -57,13 +63,41 @@ def compare_yaw_and_rate(
     by_yaw = None if is_constant else yaw
     by_rates = None if are_zero else rates
     ratio = swing_rad = math.nan
+    delay_s = 0.0
     if by_yaw is not None and by_rates is not None:
+        delay_s = _delay(imu_s, by_yaw, by_rates)
+        by_yaw = np.interp(imu_s + delay_s, imu_s, by_yaw)
         ratio = _ratio(imu_s, by_yaw, by_rates)
         if math.isfinite(ratio):
             is_said = has_yaw & has_rate
             difference = by_yaw - by_rates / _nearest(ratio)
             swing_rad = _swing(imu_s[is_said], difference[is_said])
-    return ImuState(by_yaw, by_rates, is_constant, are_zero, ratio, swing_rad)
+    return ImuState(by_yaw, by_rates, is_constant, are_zero, ratio, swing_rad, delay_s)
+
+
+def _delay(imu_s: FloatArray, yaw: FloatArray, rates: FloatArray) -> float:
+    """How much later than the rates the orientation turns [s]; 0 where it is not sure."""
+    begin = np.arange(imu_s[0] + _MAX_DELAY_S, imu_s[-1] - _MAX_DELAY_S - _WINDOW_S, 0.25)
+    by_rates = at_times(begin + _WINDOW_S, imu_s, rates) - at_times(begin, imu_s, rates)
+
+    def unlike(delay_s: float) -> float:
+        late = begin + delay_s
+        by_yaw = at_times(late + _WINDOW_S, imu_s, yaw) - at_times(late, imu_s, yaw)
+        known = np.isfinite(by_yaw) & np.isfinite(by_rates)
+        if known.sum() < 20 or min(np.ptp(by_yaw[known]), np.ptp(by_rates[known])) == 0.0:
+            return 1.0
+        if np.ptp(by_yaw[known]) < _MIN_TURN_RAD:
+            return 1.0
+        return 1.0 - abs(float(np.corrcoef(by_yaw[known], by_rates[known])[0, 1]))
+
+    delays = np.arange(-_MAX_DELAY_S, _MAX_DELAY_S + 1e-9, 0.05)
+    costs = np.array([unlike(float(delay_s)) for delay_s in delays])
+    best = int(np.argmin(costs))
+    is_sure = costs[best] < _ALIKE and costs[best] < 0.25 * unlike(0.0)
+    if not is_sure or abs(delays[best]) < _MIN_DELAY_S:
+        return 0.0
+    around = delays[best] + np.arange(-0.04, 0.041, 0.01)
+    return float(min(around, key=lambda delay_s: unlike(float(delay_s))))
 
 
 def _nearest(ratio: float) -> float:

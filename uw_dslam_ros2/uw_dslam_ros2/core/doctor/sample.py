@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.doctor.speckle import Quantity
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -42,12 +43,15 @@ class PingSample:
     """Echoes of some pings: ``stamp_s`` (P,) rising, ``points`` P arrays (N, 2) [m].
 
     The points are in the sonar's frame, x forward and y to port; ``T_base_sonar`` is where the
-    recording says that it sits.
+    recording says that it sits. ``pixels`` is what images hold by their speckle (None: not
+    known), ``pixels_read_as`` what they are taken for.
     """
 
     stamp_s: FloatArray
     points: tuple[FloatArray, ...]
     T_base_sonar: SE2 = SE2()
+    pixels: Quantity | None = None
+    pixels_read_as: str = "amplitude"
 
     def __post_init__(self) -> None:
         if (np.diff(self.stamp_s) < 0.0).any() or len(self.stamp_s) != len(self.points):

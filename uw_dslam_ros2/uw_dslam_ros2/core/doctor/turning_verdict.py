@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.examine import Examination
+from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.imu import compare_yaw_and_rate
 from uw_dslam_ros2.core.doctor.sample import NavigationSample
 from uw_dslam_ros2.core.doctor.turning import (

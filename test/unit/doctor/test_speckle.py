@@ -1,0 +1,32 @@
+"""What pixels stand for is read from speckle of known laws, and from nothing else."""
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.doctor.speckle import patch_variations, quantity_of
+
+
+def power(seed, shape=(400, 256)):
+    """Fully developed speckle over a scene that changes slowly, with a bright wall."""
+    rng = np.random.default_rng(seed)
+    scene = 1.0 + 0.8 * np.sin(np.linspace(0.0, 9.0, shape[0]))[:, None] * np.ones(shape[1])
+    scene[150:154] *= 30.0
+    return scene * rng.exponential(size=shape)
+
+
+@pytest.mark.parametrize(
+    ("exponent", "quantity"), [(1.0, "power"), (0.5, "amplitude"), (0.25, "compressed")]
+)
+def test_the_law_is_recognised(exponent, quantity):
+    images = [patch_variations((power(seed) ** exponent).astype(np.float32)) for seed in range(2)]
+    assert quantity_of(images) == quantity
+
+
+def test_nothing_is_said_of_what_shows_no_speckle():
+    coarse = np.minimum(power(0) * 0.5, 255.0).astype(np.uint8)
+    assert quantity_of([patch_variations(coarse)]) is None
+    thresholded = np.where(power(1) > 3.0, 200.0 * power(1), 0.0).astype(np.uint16)
+    assert quantity_of([patch_variations(thresholded)]) is None
+    assert quantity_of([patch_variations(np.zeros((400, 256), np.uint8))]) is None
+    assert quantity_of([patch_variations(np.ones((8, 8), np.uint8))]) is None
+    assert quantity_of([]) is None
