@@ -76,7 +76,7 @@ def _agreement(**given):
     return Agreement(**{**values, **given})
 
 
-GOOD = MatchEvidence(PoseEvidence(_agreement(), 1.0, 12.0), (), 0.05, 4.0, 16.0)
+GOOD = MatchEvidence(PoseEvidence(_agreement(), 1.0, 12.0), (), 0.05, 4.0, 16.0, 0.05)
 POOR = PoseEvidence(
     _agreement(agreement=0.6, conflict=0.3, num_walls=80, num_detail=2.0, residual_cells=1.3),
     0.5, 2.0,

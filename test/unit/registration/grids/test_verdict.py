@@ -21,7 +21,7 @@ from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.registration.rules import at_least, at_most, first_that_applies
 
 AGREEMENT = Agreement(0.5, 800, 0.95, 0.01, 0.5, 0.8, 0.08, 200.0)
-GOOD = MatchEvidence(PoseEvidence(AGREEMENT, 1.0, 12.0), (), 0.05, 4.0, 16.0)
+GOOD = MatchEvidence(PoseEvidence(AGREEMENT, 1.0, 12.0), (), 0.05, 4.0, 16.0, 0.05)
 PROVEN = Proof(num_boxes=7, score=0.5, lower_bound=0.5, upper_bound=0.52)
 
 
@@ -42,7 +42,7 @@ def random_pose(rng):
 def random_case(rng):
     rivals = tuple(random_pose(rng) for _ in range(rng.integers(0, 4)))
     evidence = MatchEvidence(
-        random_pose(rng), rivals, rng.exponential(0.2), rng.uniform(1, 9), rng.uniform(5, 18)
+        random_pose(rng), rivals, rng.exponential(0.2), rng.uniform(1, 9), rng.uniform(5, 18), 0.05
     )
     config = GridRegistrationConfig(is_proof_required=bool(rng.random() < 0.3))
     if rng.random() < 0.5:
@@ -191,7 +191,7 @@ def test_no_number_of_a_pose_that_is_not_finite_is_passed(name, is_rival, bad):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", ["deviation_m", "extent_m", "log_volume"])
+@pytest.mark.parametrize("name", ["deviation_m", "extent_m", "log_volume", "cell_m"])
 def test_no_number_of_a_match_that_is_not_finite_is_passed(name, bad):
     refused(replace(GOOD, **{name: bad}), PROVEN, bad)
 

@@ -154,8 +154,12 @@ def _standard_errors(values: FloatArray, squares: list[tuple[NDArray[np.intp], f
 
 def _squares(places: FloatArray, side: float, shift: tuple[float, float]) -> NDArray[np.intp]:
     """Number of the square (N,) that each place [x, y] (N, 2) lies in."""
-    _, index = np.unique(np.floor(places / side + shift), axis=0, return_inverse=True)
-    return index.ravel()
+    square = np.floor(places / side + shift).astype(np.int64)
+    square -= square.min(axis=0, initial=0)
+    _, index = np.unique(
+        square[:, 1] * (square[:, 0].max(initial=0) + 1) + square[:, 0], return_inverse=True
+    )
+    return index
 
 
 def _sums(values: FloatArray, index: NDArray[np.intp]) -> FloatArray:

@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.registration.grids.candidates import (
     log_volume,
 )
 from uw_dslam_ros2.core.registration.grids.covariance import PoseSpread, pose_spread
-from uw_dslam_ros2.core.registration.grids.preparation import FINE_SIGMA_CELLS
+from uw_dslam_ros2.core.registration.grids.preparation import FINE_SIGMA_CELLS, Sides
 from uw_dslam_ros2.core.registration.grids.probability import (
     MatchEvidence,
     PoseEvidence,
@@ -34,26 +34,10 @@ _SAME_CELLS = 8.0  # poses nearer than that, in cells of their level, are one an
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """Poses of the finest level, best first, how well the first is fixed, and the evidence.
-
-    ``background`` is what chance reaches.
-    """
-
-    refined: list[Candidate]
-    spread: PoseSpread
-    evidence: MatchEvidence
-    background: Background
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Judge:
-    """What two maps say about one pose after the other.
+    """What two maps say about one pose after the other, on the cells of ``sides``."""
 
-    ``sides`` are source and target on the finest problem's cells.
-    """
-
-    sides: tuple[WallMap, WallMap]
+    sides: Sides
     pyramid: Pyramid
     background: Background
 
@@ -61,14 +45,27 @@ class Judge:
         """Evidence for a pose of the finest level."""
         scanned, finest = self.pyramid.scanned, self.pyramid.finest
         T_target_source = finest.motion_of(candidate.pose)
-        scale = 1.0 / finest.resolution_m
+        scale = 1.0 / self.sides[0].cells.resolution_m
         in_cells = SE2(T_target_source.x * scale, T_target_source.y * scale, T_target_source.yaw)
         surprise = self.background.surprise(scanned.value(scanned.pose_of(T_target_source)))
         return PoseEvidence(measure_agreement(*self.sides, in_cells), candidate.score, surprise)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Poses of the finest level, best first, how well the first is fixed, and the evidence.
+
+    ``judge`` is who measured it.
+    """
+
+    refined: list[Candidate]
+    spread: PoseSpread
+    evidence: MatchEvidence
+    judge: Judge
+
+
 def weigh(
-    sides: tuple[WallMap, WallMap],
+    scales: list[Sides],
     pyramid: Pyramid,
     window: PoseWindow,
     candidates: list[Candidate],
@@ -76,27 +73,38 @@ def weigh(
 ) -> Found:
     """Refine candidates of the searched problem on the finest one, and compare them.
 
-    ``sides`` as for `Judge`; ``window`` in cells of the scanned problem.
+    ``scales`` are both maps on cells from fine to coarse. Maps that were made apart are bent
+    against each other; they are judged on the cells on which their best pose convinces most. Large
+    cells have their price: there is less detail on them, and more of the area is near a wall.
+    ``window`` is in cells of the scanned problem.
     """
     finest, volume = pyramid.finest, log_volume(pyramid, window)
-    judge = Judge(sides, pyramid, background)
-    weighed = [(c, judge.evidence(c)) for c in refine(pyramid, candidates, _NUM_REFINED)]
+
+    def logit(pair: tuple[Candidate, PoseEvidence]) -> float:
+        return pose_logit(pair[1], volume)
+
     # The objective counts what overlaps, so a pose that lays much on much may score above the true
     # one though the maps contradict it: evidence decides.
-    weighed.sort(key=lambda pair: -pose_logit(pair[1], volume))
+    refined = refine(pyramid, candidates, _NUM_REFINED)
+    judged = []
+    for judge in (Judge(sides, pyramid, background) for sides in scales):
+        pairs = sorted(((c, judge.evidence(c)) for c in refined), key=logit, reverse=True)
+        judged.append((judge, pairs))
+    judge, weighed = max(judged, key=lambda one: logit(one[1][0]))
     best, _ = weighed[0]
     apart = [p for p in weighed[1:] if not is_same_pose(finest, p[0].pose, best.pose)]
-    refined, poses = zip(weighed[0], *apart, strict=True)
-    seen = (sides[0].seen, sides[1].seen)
-    spread = pose_spread(finest, best.pose, FINE_SIGMA_CELLS, seen)
+    kept, poses = zip(weighed[0], *apart, strict=True)
+    sides = scales[0]
+    spread = pose_spread(finest, best.pose, FINE_SIGMA_CELLS, (sides[0].seen, sides[1].seen))
     evidence = MatchEvidence(
         best=poses[0],
         rivals=poses[1:],
         deviation_m=spread.weakest_cells * finest.resolution_m,
         extent_m=min(_extent(side) for side in sides) * finest.resolution_m,
         log_volume=volume,
+        cell_m=judge.sides[0].cells.resolution_m,
     )
-    return Found(list(refined), spread, evidence, background)
+    return Found(list(kept), spread, evidence, judge)
 
 
 def _extent(side: WallMap) -> float:

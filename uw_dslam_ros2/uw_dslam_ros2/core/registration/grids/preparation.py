@@ -14,7 +14,10 @@ from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.problem import build_problem
 from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid
 
-__all__ = ["FINE_SIGMA_CELLS", "prepare_maps"]
+__all__ = ["FINE_SIGMA_CELLS", "Sides", "prepare_maps"]
+
+Sides = tuple[WallMap, WallMap]
+"""Source and target on cells of one size."""
 
 FINE_SIGMA_CELLS = 2.0
 """Kernel of the walls on the finest level, in its cells."""
@@ -22,13 +25,19 @@ _FINE_POINTS = 1200
 _LEAST_SIDE_CELLS = 4
 # Cells of the scan within that distance, at least: with fewer the walls' kernels run together.
 _SCANNED_PER_SPACING = 2.0
+# Maps that are bent agree on larger cells, up to where everything free would be near a wall.
+_NUM_SCALES = 4
+_LEAST_SPACING = 4.0  # cells, between walls and the middle of the free space
 _MOST_SCANNED, _MOST_FINEST = 4.0, 2.0  # times the cells asked for, of a map far larger
 
 
 def prepare_maps(
     source: OccupancyMap, target: OccupancyMap, config: GridRegistrationConfig
-) -> tuple[Pyramid, tuple[WallMap, WallMap]] | str:
-    """Problems from coarse to fine, and both maps; or what a map lacks, as a sentence."""
+) -> tuple[Pyramid, list[Sides]] | str:
+    """Problems from coarse to fine, and both maps from fine to coarse; or what a map lacks.
+
+    The finest problem and the finest maps are on the same cells.
+    """
     resolution_m = _finest_resolution(source, target, config.finest_cells)
     sides = []
     for name, occupancy in (("source", source), ("target", target)):
@@ -36,8 +45,20 @@ def prepare_maps(
         if (fault := _too_little(name, occupancy, cells, config.min_wall_cells)) is not None:
             return fault
         sides.append(coarsen(cells, resolution_m))
-    walls = (WallMap(sides[0]), WallMap(sides[1]))
-    return _levels(*walls, config), walls
+    finest = (WallMap(sides[0]), WallMap(sides[1]))
+    return _levels(*finest, config), _scales(finest)
+
+
+def _scales(finest: Sides) -> list[Sides]:
+    """Both maps on cells doubled each time, as long as walls stand apart from each other."""
+    spacing = min(_wall_spacing(walls) for walls in finest)
+    scales = [finest]
+    while len(scales) < _NUM_SCALES and 2 ** len(scales) * _LEAST_SPACING <= spacing < math.inf:
+        cells = [
+            coarsen(walls.cells, walls.cells.resolution_m * 2.0 ** len(scales)) for walls in finest
+        ]
+        scales.append((WallMap(cells[0]), WallMap(cells[1])))
+    return scales
 
 
 def _finest_resolution(source: OccupancyMap, target: OccupancyMap, num_cells: int) -> float:

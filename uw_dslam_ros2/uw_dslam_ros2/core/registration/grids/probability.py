@@ -47,7 +47,8 @@ class MatchEvidence:
     ``deviation_m`` is the best pose's standard deviation in the direction that is fixed the least,
     at the rim for turns; ``extent_m`` the root mean square distance of the walls of the smaller
     map from their mean. ``log_volume`` is the logarithm of the number of poses that were searched:
-    the more there are, the better the best of them is by chance.
+    the more there are, the better the best of them is by chance. ``cell_m`` is the side of the
+    cells on which the maps agree best, and which all of this is counted in.
     """
 
     best: PoseEvidence
@@ -55,6 +56,7 @@ class MatchEvidence:
     deviation_m: float
     extent_m: float
     log_volume: float
+    cell_m: float
 
     @property
     def rival_share(self) -> float:

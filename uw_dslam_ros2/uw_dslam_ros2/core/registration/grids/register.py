@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.registration.grids.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.crop import crop_to_known
@@ -145,11 +144,11 @@ class _GridMatch:
         prepared = prepare_maps(self._source, self._target, self._config)
         if isinstance(prepared, str):
             return self._refused(Verdict.TOO_FEW_FEATURES, prepared)
-        pyramid, walls = prepared
+        pyramid, scales = prepared
         searched = pyramid.searched
         window = self._frames.window(pyramid.scanned, self._prior)
         candidates, background = scan_candidates(pyramid, window)
-        found = weigh(walls, pyramid, window, candidates, background)
+        found = weigh(scales, pyramid, window, candidates, background)
         verdict, _, _ = decide(found.evidence, self._config)
         # What the evidence refuses anyway gets a short search, which may find better.
         num_boxes = self._config.max_boxes
@@ -167,22 +166,20 @@ class _GridMatch:
         if is_better or (verdict is Verdict.ACCEPTED and not outcome.is_complete):
             # Where the proof is open, the poses that it could not exclude are rivals like others.
             candidates = merge_best(searched, candidates, outcome)
-            found = weigh(walls, pyramid, window, candidates, background)
-        return self._answer(
-            pyramid, outcome, _with_symmetric_rivals(found, walls, pyramid, window)
-        )
+            found = weigh(scales, pyramid, window, candidates, background)
+        return self._answer(pyramid, outcome, _with_symmetric_rivals(found, pyramid, window))
 
     def collect(self) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
         """Evidence, and that of each pose by itself; None where a map holds too little."""
         prepared = prepare_maps(self._source, self._target, self._config)
         if isinstance(prepared, str):
             return None
-        pyramid, walls = prepared
+        pyramid, scales = prepared
         window = self._frames.window(pyramid.scanned, self._prior)
-        found = weigh(walls, pyramid, window, *scan_candidates(pyramid, window))
+        found = weigh(scales, pyramid, window, *scan_candidates(pyramid, window))
         weighed = (found.evidence.best, *found.evidence.rivals)
         motions = [self._frames.to_frames(pyramid.finest.motion_of(c.pose)) for c in found.refined]
-        evidence = _with_symmetric_rivals(found, walls, pyramid, window).evidence
+        evidence = _with_symmetric_rivals(found, pyramid, window).evidence
         return evidence, list(zip(weighed, motions, strict=True))
 
     def _certify(
@@ -271,10 +268,8 @@ class _GridMatch:
         return RegistrationResult.refused(verdict, reason, seconds=self._elapsed())
 
 
-def _with_symmetric_rivals(
-    found: Found, walls: tuple[WallMap, WallMap], pyramid: Pyramid, window: PoseWindow
-) -> Found:
+def _with_symmetric_rivals(found: Found, pyramid: Pyramid, window: PoseWindow) -> Found:
     """Symmetries only matter to a match that would be convincing without them."""
     if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_TWINS:
         return found
-    return add_symmetric_rivals(found, walls, pyramid, window)
+    return add_symmetric_rivals(found, pyramid, window)

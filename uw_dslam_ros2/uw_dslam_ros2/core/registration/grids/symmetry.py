@@ -39,21 +39,19 @@ class _Likeness:
 
 def add_symmetric_rivals(
     found: Found,
-    sides: tuple[WallMap, WallMap],
     pyramid: Pyramid,
     window: PoseWindow,
 ) -> Found:
     """Evidence with the rivals that likenesses within either map make.
 
-    ``sides``, ``pyramid`` and ``window``, beyond which nothing is a rival, as for
-    `grid_evidence.weigh`. Where a map is laid on itself by S, a match T has the rival T S (or S T,
-    on the target's side). Unless the two maps refute it, that rival is as convincing as the
-    likeness, and at most as the match.
+    ``pyramid`` and ``window``, beyond which nothing is a rival, as for `evidence.weigh`. Where a
+    map is laid on itself by S, a match T has the rival T S (or S T, on the target's side). Unless
+    the two maps refute it, that rival is as convincing as the likeness, and at most as the match.
     """
     finest, evidence = pyramid.finest, found.evidence
     T_target_source = finest.motion_of(found.refined[0].pose)
     aliases = []
-    for is_source, walls in zip((True, False), sides, strict=True):
+    for is_source, walls in zip((True, False), found.judge.sides, strict=True):
         itself = replace(
             pyramid, problems=tuple(_on_itself(p, is_source) for p in pyramid.problems)
         )
@@ -64,7 +62,6 @@ def add_symmetric_rivals(
                 )
     if not aliases:
         return found
-    judge = Judge(sides, pyramid, found.background)
 
     def logit(pose: PoseEvidence) -> float:
         return pose_logit(pose, evidence.log_volume)
@@ -77,7 +74,7 @@ def add_symmetric_rivals(
         same = [k for k, c in enumerate(refined) if is_same_pose(finest, c.pose, candidate.pose)]
         if same and same[0] == 0:
             continue
-        seen = judge.evidence(candidate)
+        seen = found.judge.evidence(candidate)
         if seen.agreement.agreement >= _REFUTED_SHARE * evidence.best.agreement.agreement:
             weaker = min(likeness.evidence, evidence.best, key=logit)
             seen = max(seen, replace(weaker, score=seen.score), key=logit)

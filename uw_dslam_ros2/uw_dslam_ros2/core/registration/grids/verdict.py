@@ -111,7 +111,7 @@ class _Case:
             f"{agreement.agreement:.0%} of the common walls agree, {agreement.conflict:.0%} "
             f"conflict, overlap {agreement.overlap:.0%}, best rival "
             f"{self.evidence.rival_share:.0%}, score {self.evidence.best.surprise:.1f} "
-            "deviations above chance"
+            f"deviations above chance, on cells of {self.evidence.cell_m:.2g} m"
         )
 
     @property
@@ -245,6 +245,7 @@ def _not_finite(evidence: MatchEvidence, proof: Proof) -> Iterator[str]:
         ("the standard deviation", evidence.deviation_m),
         ("the extent of the walls", evidence.extent_m),
         ("the number of poses searched", evidence.log_volume),
+        ("the side of the cells", evidence.cell_m),
         ("the score in the search", proof.score),
         ("the lower bound", proof.lower_bound),
         ("the upper bound", proof.upper_bound),
