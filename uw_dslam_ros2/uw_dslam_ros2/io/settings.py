@@ -28,7 +28,7 @@ from uw_dslam_ros2.io.sensor_settings import SensorConfig
 
 __all__ = ["NODES", "REMOVED", "SECTIONS", "SettingsFile"]
 
-SECTIONS = ("mapper", "registration", "points", "queue", "topics", "conventions")
+SECTIONS = ("mapper", "registration", "points", "queue", "maps", "topics", "conventions")
 """Groups of settings that are part of the core; everything else concerns a node alone."""
 
 REMOVED = {

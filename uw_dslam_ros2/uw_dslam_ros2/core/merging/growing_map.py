@@ -39,7 +39,7 @@ _JUMP_SHARE = 0.5
 class GrowingMapConfig(Config):
     """How a map that grows as a whole is cut into submaps."""
 
-    tile_m: float = setting(20.0, 1.0, 1000.0, "side of the squares that a map is cut into [m]")
+    tile_m: float = setting(25.0, 1.0, 1000.0, "side of the squares that a map is cut into [m]")
     min_change: float = setting(
         0.1, 0.001, 1.0, "share of a square that must have changed before it is matched again"
     )

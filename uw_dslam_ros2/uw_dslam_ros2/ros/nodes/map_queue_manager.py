@@ -23,6 +23,8 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import (
     Constraint,
     ConstraintKind,
+    GrowingMapConfig,
+    MapChange,
     MapQueue,
     MapQueueConfig,
     MatchRequest,
@@ -46,6 +48,7 @@ from uw_dslam_ros2.ros.convert.registration import options_to_msg, registration_
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, FrameBroadcaster, transform_to_msg
 from uw_dslam_ros2.ros.plumbing.idle_timeout import IdleTimeout
+from uw_dslam_ros2.ros.plumbing.map_inputs import MapInputs
 from uw_dslam_ros2.ros.plumbing.map_publisher import MapPublisher
 from uw_dslam_ros2.ros.plumbing.missing_submaps import MissingSubmaps
 from uw_dslam_ros2.ros.plumbing.node_settings import MapQueueManagerConfig
@@ -77,6 +80,7 @@ class MapQueueManager(Node):
         super().__init__("map_queue_manager", **kwargs)
         self._config = declare_config(self, MapQueueManagerConfig)
         self._queue_config = declare_config(self, MapQueueConfig, "queue")
+        growing_config = declare_config(self, GrowingMapConfig, "maps")
         refuse_unknown_parameters(self)
         self._queue = MapQueue(self._queue_config)
         self._message = "waiting for submaps"
@@ -108,6 +112,17 @@ class MapQueueManager(Node):
             self._worker.post,
         )
         self._missing = MissingSubmaps(self, self._worker.post, self._on_submap)
+        self._maps = MapInputs(
+            self,
+            self._config.map_topics,
+            is_discovering=self._config.is_discovering_maps,
+            config=growing_config,
+            post=self._worker.post,
+            on_change=self._on_map_change,
+            on_growth=lambda: self._idle.note(time.monotonic()),
+            complain=self.complain,
+            submaps_of=self._submaps_of,
+        )
         for vehicle_id in self._config.vehicles:
             self._subscribe(f"/{vehicle_id.strip('/')}/submap")
         QueueServices(self, self, self._worker, self._group)
@@ -180,6 +195,20 @@ class MapQueueManager(Node):
         self._idle.note(time.monotonic())
         self.changed(f"{submap.submap_id} revision {submap.revision} received")
 
+    def _on_map_change(self, topic: str, vehicle_id: str, change: MapChange) -> None:
+        if change.has_jumped:
+            self.get_logger().warning(
+                f"the map of {vehicle_id} has jumped: it is matched anew",
+                throttle_duration_sec=WARNING_PERIOD_S,
+            )
+            self._queue.forget_answers(vehicle_id)
+        for submap in change.submaps:
+            self._add_submap(topic, submap)
+
+    def _submaps_of(self, vehicle_id: str) -> list[Submap]:
+        submaps = (record.submap for record in self._queue.submaps())
+        return [submap for submap in submaps if submap.vehicle_id == vehicle_id]
+
     def changed(self, message: str) -> None:
         """Note that the queue was changed."""
         self._message = message
@@ -195,6 +224,8 @@ class MapQueueManager(Node):
             self._missing.look(self._queue.missing())
         for request_id, reason in self._servers.take_lost():
             self._ask_again(request_id, reason)
+        if not self._idle.is_active(now_s):
+            self._maps.rest()
         self._queue.is_growing = self._idle.is_active(now_s)
         self._ask()
         # First saved, then told: what anybody has heard of outlives a kill.
@@ -211,6 +242,7 @@ class MapQueueManager(Node):
 
     def _discover(self) -> None:
         self._servers.discover()
+        self._maps.look()
         if not self._config.vehicles:
             for topic, types in self.get_topic_names_and_types():
                 if _SUBMAP_TYPE in types:
@@ -340,7 +372,10 @@ class MapQueueManager(Node):
         stamp = self.get_clock().now().to_msg()
         frame_id = self._config.map_frame
         self._broadcaster.send(
-            *(transform_to_msg(stamp, frame_id, f"{name}/map", T) for name, T in places)
+            *(
+                transform_to_msg(stamp, frame_id, self._maps.frame_of(name, frame_id), T)
+                for name, T in places
+            )
         )
 
     # --- what the services ask for -----------------------------------------------------------
@@ -356,11 +391,13 @@ class MapQueueManager(Node):
         self._servers.forget_all()
         self._asked.clear()
         self._queue = queue
+        self._maps.forget()
         self._map.clear()
         return queue
 
     def settle(self) -> None:
         """No more submaps are expected: ask all that is left."""
+        self._maps.rest()
         self._idle.end()
         self._tick()
 

@@ -62,6 +62,16 @@ class MapQueueManagerConfig(Config):
         doc="vehicles whose submaps are taken; empty: every topic of type Submap on the graph",
         is_basic=True,
     )
+    map_topics: tuple[str, ...] = setting(
+        (),
+        doc="maps that grow (nav_msgs/OccupancyGrid), one for each vehicle: [/robot1/map, ...]",
+        is_basic=True,
+    )
+    is_discovering_maps: bool = setting(
+        False,
+        doc="take every topic <vehicle>/map of a vehicle that sends no submaps, too",
+        is_basic=True,
+    )
     servers: tuple[str, ...] = setting(
         (),
         doc="registration servers (node names) that are asked; empty: all on the graph",

@@ -18,7 +18,7 @@ from typing import Any
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
-from uw_dslam_ros2.core.merging import MapQueueConfig
+from uw_dslam_ros2.core.merging import GrowingMapConfig, MapQueueConfig
 from uw_dslam_ros2.core.registration import GridRegistrationConfig, RegistrationConfig
 from uw_dslam_ros2.ros.plumbing.node_settings import NODE_CONFIGS
 from uw_dslam_ros2.ros.plumbing.parameters import parameter_type, settings_of
@@ -31,7 +31,7 @@ GROUPS: dict[str, tuple[tuple[str, type[Config]], ...]] = {
         ("registration", GridRegistrationConfig),
         ("points", RegistrationConfig),
     ),
-    "map_queue_manager": (("queue", MapQueueConfig),),
+    "map_queue_manager": (("queue", MapQueueConfig), ("maps", GrowingMapConfig)),
     "bag_player": (),
 }
 """Groups of parameters of each node, beside its own."""
