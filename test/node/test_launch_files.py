@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 FILES = sorted((Path(__file__).parents[2] / "uw_dslam_ros2" / "launch").glob("*.launch.py"))
+AGGREGATOR = Path(__file__).parents[2] / "uw_dslam_ros2" / "launch" / "aggregator.yaml"
 RVIZ = Path(__file__).parents[2] / "uw_dslam_ros2" / "rviz" / "uw_dslam.rviz"
 
 
@@ -58,6 +59,19 @@ def test_as_many_vehicles_as_asked(arguments, num_mappers, has_player):
     assert names.count("sonar_mapper") == num_mappers
     assert names.count("registration_server") == names.count("map_queue_manager") == 1
     assert ("bag_player" in names) == has_player
+
+
+def test_every_kind_of_node_has_its_place_among_the_diagnostics():
+    """A status is named after the node with its namespace, and again without, by `Diagnostics`."""
+    parameters = yaml.safe_load(AGGREGATOR.read_text())["analyzers"]["ros__parameters"]
+    groups = [group for group in parameters.values() if isinstance(group, dict)]
+    for name in ("sonar_mapper", "registration_server", "map_queue_manager"):
+        status = f"auv_1/{name}: {name}"
+        takers = [g for g in groups if any(part in status for part in g["contains"])]
+        assert len(takers) == 1
+    for group in groups:
+        assert group["type"] == "diagnostic_aggregator/GenericAnalyzer"
+        assert group["timeout"] > 1.0, "one status a second is sent"
 
 
 def test_rviz_shows_the_maps_and_the_graph():

@@ -134,6 +134,17 @@ def make_nodes(context):
             condition=IfCondition(LaunchConfiguration("rviz")),
         )
     )
+    nodes.append(
+        Node(
+            package="diagnostic_aggregator",
+            executable="aggregator_node",
+            name="analyzers",
+            parameters=[
+                PathJoinSubstitution([FindPackageShare(PACKAGE), "launch", "aggregator.yaml"])
+            ],
+            condition=IfCondition(LaunchConfiguration("aggregator")),
+        )
+    )
     if not is_replay:
         return nodes
     player = Node(
@@ -180,6 +191,7 @@ def generate_launch_description():
         "mapper_config": ("", "a further YAML file for the mappers"),
         "exit_at_end": ("false", "end everything when the bags are played"),
         "rviz": ("false", "start RViz"),
+        "aggregator": ("false", "start the diagnostic_aggregator with a tree of all nodes"),
     }
     return LaunchDescription(
         [
