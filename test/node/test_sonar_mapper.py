@@ -346,3 +346,25 @@ def test_best_effort_driver_is_heard(ros_context, spinning):
 def test_bad_setting_is_refused(ros_context, namespace, settings, words):
     with pytest.raises(ConfigError, match=words):
         mapper_of(ros_context, namespace or None, **settings)
+
+
+def test_a_convention_that_is_not_followed_is_told_by_diagnostics(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context, reorder_s=1.0)
+
+    def level():
+        return [status.level for msg in vehicle.diagnostics[-1:] for status in msg.status]
+
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        for half_second in range(320):
+            imu = Imu()
+            imu.header.stamp = stamp_to_msg(START_NS + half_second * 500_000_000)
+            imu.orientation_covariance[8] = 1e-4
+            imu.angular_velocity.z = 0.3
+            vehicle.imu_pub.publish(imu)
+            until(
+                lambda n=half_second: int(vehicle.values().get("num_imu", "0")) > n - 80, "the IMU"
+            )
+        until(lambda: "its orientation never changes" in vehicle.message(), "the finding")
+        assert level() == [DiagnosticStatus.WARN]

@@ -39,6 +39,7 @@ from uw_dslam_ros2.ros.convert.core_types import (
     submap_to_msg,
 )
 from uw_dslam_ros2.ros.plumbing.batched_subscription import subscribe_batched
+from uw_dslam_ros2.ros.plumbing.convention_watch import ConventionWatch
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.frames import (
     WARNING_PERIOD_S,
@@ -100,6 +101,9 @@ class SonarMapper(Node):
         self._num_breaks_told = 0
         self._heard_s = time.monotonic()
         self._worker = Worker("mapper", self._on_worker_error)
+        self._watch = ConventionWatch(
+            self._mapper_config.sonar, self._vehicle_id, self._on_convention, self._on_worker_error
+        )
         self._create_publishers()
         group = MutuallyExclusiveCallbackGroup()
         self._mounts = Mounts(self, lambda: self._worker.post(self._drain), callback_group=group)
@@ -130,6 +134,7 @@ class SonarMapper(Node):
     def stop(self) -> None:
         """End the worker after the job at hand."""
         self._worker.close(timeout_s=5.0)
+        self._watch.close()
 
     def destroy_node(self) -> None:
         """Stop, then destroy."""
@@ -200,6 +205,9 @@ class SonarMapper(Node):
         if finding.severity != "info":
             self._problem = finding.sentence
             self.get_logger().warning(finding.sentence, throttle_duration_sec=WARNING_PERIOD_S)
+
+    def _on_convention(self, finding: Finding) -> None:
+        self.get_logger().warning(finding.sentence)
 
     # --- messages to events ------------------------------------------------------------------
 
@@ -329,6 +337,7 @@ class SonarMapper(Node):
         try:
             mounting = correct_mounting(event, T_base_sensor, self._config.conventions)
             submaps = feed_runs(self._runs, event, mounting)
+            self._watch.take(event, mounting)
         except InvalidInputError as error:
             self._complain(f"{type(event).__name__} of {event.frame_id}: {error}")
             return
@@ -462,6 +471,9 @@ class SonarMapper(Node):
         num_pings = self._mapper_values.get("num_pings", 0)
         problem = self._last_problem or self._problem
         severity, silence = self._silence()
+        if conventions := self._watch.sentence:
+            severity = max(severity, "warning", key=SEVERITIES.index)
+            problem = conventions
         if not num_pings:
             text = problem or "no ping mapped yet"
             return max(severity, "warning", key=SEVERITIES.index), silence or text, values
