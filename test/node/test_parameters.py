@@ -88,6 +88,7 @@ def test_parameters_carry_text_and_range_and_are_read_only(declare):
         ("group__cuont", 5, ["group.cuont", "unknown", "did you mean group.count"]),
         ("gruop__count", 5, ["gruop.count", "unknown", "group.count"]),
         ("count", 5, ["count", "unknown"]),
+        ("qos_overrides__submap__publisher__depth", 5, ["qos_overrides.submap", "change nothing"]),
     ],
 )
 def test_bad_parameter_is_refused_by_name(declare, name, value, words):

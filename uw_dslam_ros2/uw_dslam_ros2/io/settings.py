@@ -263,7 +263,7 @@ def _check_pattern(label: str, pattern: str) -> None:
 def _check_heads(label: str, pattern: str, values: _Tree) -> None:
     """A group with a typing error would be taken for a parameter of a node, and be lost."""
     for key, value in values.items():
-        if isinstance(value, dict) and key not in SECTIONS and key != "qos_overrides":
+        if isinstance(value, dict) and key not in SECTIONS:
             raise ConfigError(
                 f"{label}: {pattern}: {key!r} is no group of settings; there are "
                 f"{', '.join(SECTIONS)}{_nearest(key, SECTIONS)}"

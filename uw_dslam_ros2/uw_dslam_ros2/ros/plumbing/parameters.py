@@ -24,6 +24,7 @@ from uw_dslam_ros2.ros.plumbing.node_settings import names_of_all_nodes
 __all__ = ["declare_config", "refuse_unknown_parameters", "settings_of"]
 
 _OWN_TO_RCLPY = ("use_sim_time", "start_type_description_service")
+_QOS_HEAD = "qos_overrides"
 _TYPES = {
     bool: Parameter.Type.BOOL,
     int: Parameter.Type.INTEGER,
@@ -115,13 +116,13 @@ def refuse_unknown_parameters(node: Node) -> None:
     for name in sorted(_given(node)):
         head = name.split(".")[0]
         is_anothers = name in anothers or (head in SECTIONS and head not in own)
-        if (
-            node.has_parameter(name)
-            or name in _OWN_TO_RCLPY
-            or head == "qos_overrides"
-            or is_anothers
-        ):
+        if node.has_parameter(name) or name in _OWN_TO_RCLPY or is_anothers:
             continue
+        if head == _QOS_HEAD:
+            raise ConfigError(
+                f"parameter {name} would change nothing: {node.get_name()} has the quality of "
+                "service that the documentation of its topics says"
+            )
         if name in REMOVED:
             raise ConfigError(f"parameter {name} is no setting any more; {REMOVED[name]}")
         raise ConfigError(
