@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.merging import MapQueueConfig
-from uw_dslam_ros2.core.registration import RegistrationConfig
+from uw_dslam_ros2.core.registration import GridRegistrationConfig, RegistrationConfig
 from uw_dslam_ros2.io.settings import REMOVED, SettingsFile
 
 
@@ -130,6 +130,7 @@ def test_removed_settings_are_removed(name):
         "mapper": VehicleMapperConfig(),
         "queue": MapQueueConfig(),
         "points": RegistrationConfig(),
+        "registration": GridRegistrationConfig(),
     }
     inner = settings[group].to_dict() if rest else {}
     for part in rest.split("."):
