@@ -32,6 +32,8 @@ from uw_dslam_ros2.io.vehicles import VehicleRecording, find_recordings
 __all__ = ["main"]
 
 _FEW_MOTIONS = 15
+_TURNING_CELL_M = 0.25
+"""Beams of a sonar that turns lie a degree or two apart: finer cells hold nothing more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,8 @@ class Diagnosis:
     num_ping_motions: int
     sonar_changes: Mapping[str, str]
     pixels: str
+    num_turning_windows: int
+    is_turning: bool
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -151,6 +155,8 @@ def _diagnose(
         examined.num_ping_motions,
         examined.sonar_changes,
         examined.pixels,
+        examined.num_turning_windows,
+        examined.is_turning,
     )
 
 
@@ -179,20 +185,30 @@ def _print(diagnosis: Diagnosis) -> None:
             f"  {WORDS.get(s.role, s.role):9} {s.topic:30} {s.num_messages:7} messages, "
             f"{s.rate_hz:.3g} Hz, {s.start_s:.1f} to {s.end_s:.1f} s"
         )
-    print(f"  examined by {diagnosis.num_ping_motions} motions from ping to ping")
+    if diagnosis.is_turning:
+        print(f"  examined by {diagnosis.num_turning_windows} spans of a sonar that turns")
+    else:
+        print(f"  examined by {diagnosis.num_ping_motions} motions from ping to ping")
 
 
 def _settings(diagnoses: Sequence[Diagnosis]) -> str:
     content: dict[str, Any] = {}
+    # Maps of one mission have cells of one size.
+    is_coarse = bool(diagnoses) and all(diagnosis.is_turning for diagnosis in diagnoses)
     for diagnosis in diagnoses:
         parameters: dict[str, Any] = {}
         if changes := diagnosis.conventions.changes():
             parameters["conventions"] = changes
+        mapper: dict[str, Any] = {}
         if diagnosis.sonar_changes:
-            parameters["mapper"] = {"sonar": dict(diagnosis.sonar_changes)}
+            mapper["sonar"] = dict(diagnosis.sonar_changes)
+        if is_coarse:
+            mapper["occupancy"] = {"resolution_m": _TURNING_CELL_M}
+        if mapper:
+            parameters["mapper"] = mapper
         if parameters:
             content[f"/{diagnosis.vehicle_id}/sonar_mapper"] = {"ros__parameters": parameters}
-    head = "# What mends this recording; nothing, if this is all.\n"
+    head = "# What mends this recording or suits its sonar; nothing, if this is all.\n"
     return head + (yaml.safe_dump(content, sort_keys=True) if content else "")
 
 
@@ -206,6 +222,8 @@ def _report(diagnoses: Sequence[Diagnosis], findings: Sequence[Finding]) -> dict
                 "conventions": d.conventions.to_dict(),
                 "num_ping_motions": d.num_ping_motions,
                 "pixels": d.pixels,
+                "num_turning_windows": d.num_turning_windows,
+                "is_turning": d.is_turning,
             }
             for d in diagnoses
         ],

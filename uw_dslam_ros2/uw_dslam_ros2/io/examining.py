@@ -92,6 +92,7 @@ def examine_readings(
         collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in wanted)
     found = examine(collector.navigation(), collector.pings(), vehicle_id)
     if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):
+        found.is_turning = True
         spans = choose_spans(navigation, collector.seconds(np.unique(stamps["sonar"])))
         inside = _inside(spans, collector.start_ns)
         collect(lambda role, stamp_ns: role == "sonar" and inside(stamp_ns))

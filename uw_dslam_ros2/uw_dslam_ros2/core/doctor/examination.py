@@ -18,6 +18,9 @@ class Examination:
     conventions: Conventions = field(default_factory=Conventions)
     num_ping_motions: int = 0
     num_turning_windows: int = 0
+    """Spans in which turns of a sonar were compared."""
+    is_turning: bool = False
+    """Whether the sonar turns."""
     mended: set[str] = field(default_factory=set)
     """Kinds of findings that the conventions or the front end's settings mend."""
     sonar_changes: dict[str, str] = field(default_factory=dict)
