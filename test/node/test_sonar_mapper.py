@@ -220,6 +220,35 @@ def test_mounts_may_come_after_the_first_messages(ros_context, spinning):
         assert "2 pings mapped" in response.message
 
 
+@pytest.mark.parametrize("topic", ["/tf", "/auv_1/tf_static"])
+def test_mounts_are_heard_wherever_they_are_sent(ros_context, spinning, topic):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    vehicle.static_pub = vehicle.node.create_publisher(
+        TFMessage, topic, 100 if topic == "/tf" else STATIC_TF
+    )
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        vehicle.send_second(0)
+        assert "2 pings mapped" in finish(until, vehicle).message
+    assert vehicle.frames  # what the mapper itself sends on /tf is no mount
+
+
+def test_a_sonar_that_looks_down_is_told(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        half_rad = math.radians(10.0)
+        mount = TransformStamped(child_frame_id="auv_1/sonar")
+        mount.header.frame_id = "auv_1/base_link"
+        mount.transform.rotation.y = math.sin(half_rad)
+        mount.transform.rotation.w = math.cos(half_rad)
+        vehicle.static_pub.publish(TFMessage(transforms=[mount]))
+        vehicle.send_second(0)
+        assert finish(until, vehicle).success
+        until(lambda: "points 20 degrees up or down" in vehicle.message(), "it")
+
+
 def test_bad_messages_are_told_and_survived(ros_context, spinning):
     vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
     with spinning(mapper, vehicle.node) as until:
@@ -238,15 +267,15 @@ def test_bad_messages_are_told_and_survived(ros_context, spinning):
         assert "4 pings mapped" in finish(until, vehicle).message
 
 
-def test_unknown_frame_is_named(ros_context, spinning):
+def test_an_unknown_frame_is_named_and_taken_to_look_ahead(ros_context, spinning):
     vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
     with spinning(mapper, vehicle.node) as until:
         until(vehicle.is_connected, "connection")
         for second in range(3):
             vehicle.send_second(second)
         until(lambda: vehicle.values().get("num_scan") == "6", "the scans")
-        assert "0 pings mapped" in finish(until, vehicle, num_frames=0).message
-        until(lambda: "where auv_1/sonar is on auv_1/base_link" in vehicle.message(), "the name")
+        assert "6 pings mapped" in finish(until, vehicle, num_frames=0).message
+        until(lambda: "says where its frame 'auv_1/sonar' sits" in vehicle.message(), "the name")
 
 
 def test_recording_that_begins_again_begins_a_new_run_and_keeps_the_old_one(ros_context, spinning):

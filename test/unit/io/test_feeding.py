@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from uw_dslam_ros2.core.mapping import OccupancyConfig, VehicleMapper, VehicleMapperConfig
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import SonarConfig
-from uw_dslam_ros2.io.feeding import Mountings, feed, in_stamp_order
+from uw_dslam_ros2.io.feeding import feed, in_stamp_order
+from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.readings import (
     ImuEvent,
     PointsEvent,

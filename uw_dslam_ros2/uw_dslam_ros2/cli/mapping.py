@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 import multiprocessing
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -29,7 +28,8 @@ from uw_dslam_ros2.io.bags import ImuEvent, TransformEvent, TruthEvent
 from uw_dslam_ros2.io.conventions import correct_mounting
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.examining import examine_recording, mended
-from uw_dslam_ros2.io.feeding import Mountings, feed_runs, in_stamp_order, role_of
+from uw_dslam_ros2.io.feeding import feed_runs, in_stamp_order
+from uw_dslam_ros2.io.mountings import Mountings, role_of
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.topics import base_frame_of
@@ -232,7 +232,7 @@ def map_recording(
         (
             *findings,
             *reader.findings,
-            *_mounting_findings(mountings, recording.vehicle_id),
+            *mountings.findings(recording.vehicle_id),
             *health_findings(vehicle),
         ),
     )
@@ -250,31 +250,6 @@ def mountings_of(
     for transform in known:
         mountings.add(transform)
     return mountings
-
-
-def _mounting_findings(mountings: Mountings, vehicle_id: str) -> list[Finding]:
-    unknown = [
-        Finding(
-            "no_mounting",
-            "velocity" if word == "dvl" else word,
-            f"no transform says where its frame {frame_id!r} sits; it is taken to sit "
-            "at the origin, level and looking ahead",
-            vehicle_id=vehicle_id,
-        )
-        for frame_id, word in sorted(mountings.unknown.items())
-    ]
-    tilted = [
-        Finding(
-            "sonar_tilted",
-            "sonar",
-            f"its frame {frame_id!r} points {math.degrees(tilt_rad):.0f} degrees up or down; each "
-            "beam is projected by its middle, but how high an echo lies in the beam is not known, "
-            "so that walls may be some per cent off: mount it level where a true map is wanted",
-            vehicle_id=vehicle_id,
-        )
-        for frame_id, tilt_rad in sorted(mountings.tilted.items())
-    ]
-    return unknown + tilted
 
 
 def _new_run(reason: RunBreak) -> Finding:

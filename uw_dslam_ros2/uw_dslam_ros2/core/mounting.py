@@ -161,6 +161,9 @@ class StaticFrames:
         matrix = np.asarray(T_parent_frame, dtype=np.float64)
         self._parent[frame_id.strip("/")] = (parent_frame_id.strip("/"), matrix)
 
+    def __len__(self) -> int:
+        return len(self._parent)
+
     def __contains__(self, frame_id: str) -> bool:
         return frame_id.strip("/") in self._parent
 

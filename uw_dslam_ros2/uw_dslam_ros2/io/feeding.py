@@ -9,12 +9,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleRuns
 from uw_dslam_ros2.core.mounting import (
-    StaticFrames,
     fan_mount,
-    fan_tilt,
     level_rotation,
     rotation_of_quaternion,
 )
@@ -25,25 +22,20 @@ from uw_dslam_ros2.io.readings import (
     PINGS,
     BeamsEvent,
     DepthEvent,
-    FixEvent,
     ImageEvent,
     ImuEvent,
     PointsEvent,
     PoseEvent,
     Reading,
     ScanEvent,
-    TransformEvent,
     VelocityEvent,
 )
 
 __all__ = [
-    "Mountings",
     "SensorEvent",
     "feed",
     "feed_runs",
     "in_stamp_order",
-    "role_of",
-    "usual_mounting",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -51,7 +43,6 @@ FloatArray = NDArray[np.float64]
 SensorEvent = Reading
 
 _HOLD_NS = 2_000_000_000
-_NOTABLE_TILT_RAD = math.radians(10.0)  # shortens ranges by 1.5 %
 
 
 def in_stamp_order[EventT](events: Iterable[EventT]) -> Iterator[EventT]:
@@ -76,86 +67,6 @@ def in_stamp_order[EventT](events: Iterable[EventT]) -> Iterator[EventT]:
 
 def _rank(event: SensorEvent) -> int:
     return 0 if isinstance(event, ImuEvent) else 1 + isinstance(event, PINGS)
-
-
-class Mountings:
-    """Where the instruments of a vehicle sit, as transforms tell it.
-
-    Parameters
-    ----------
-    base_frame_id
-        Frame of the vehicle's body.
-
-    Attributes
-    ----------
-    unknown : dict[str, str]
-        Frames that no transform leads from to the body -> kind of reading. They are taken to sit
-        at its origin, with the axes that their message's definition says.
-    tilted : dict[str, float]
-        Frames of sonars that point notably up or down -> by how much [rad].
-    """
-
-    def __init__(self, base_frame_id: str) -> None:
-        self._base_frame_id = base_frame_id
-        self._frames = StaticFrames()
-        self._known: dict[tuple[type, str], FloatArray] = {}
-        self.unknown: dict[str, str] = {}
-        self.tilted: dict[str, float] = {}
-
-    def add(self, event: TransformEvent) -> None:
-        """Take a transform."""
-        self._frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
-        self._known.clear()
-        self.unknown.clear()
-
-    def of(self, event: Reading) -> FloatArray:
-        """``T_base_sensor`` (4, 4) of the instrument that said this."""
-        frame_id = event.child_frame_id if isinstance(event, PoseEvent) else event.frame_id
-        key = type(event), frame_id
-        if key not in self._known:
-            mounting = self._known[key] = self._mounting(event, frame_id)
-            if role_of(event) == "sonar":
-                forward = event.forward if isinstance(event, ImageEvent) else "x"
-                if (tilt_rad := fan_tilt(mounting, forward)) > _NOTABLE_TILT_RAD:
-                    self.tilted[frame_id] = tilt_rad
-        return self._known[key]
-
-    def _mounting(self, event: Reading, frame_id: str) -> FloatArray:
-        if frame_id.strip("/") in ("", self._base_frame_id.strip("/")):
-            return np.eye(4)
-        try:
-            return self._frames.lookup(self._base_frame_id, frame_id)
-        except InvalidInputError:
-            if not isinstance(event, DepthEvent | PoseEvent | FixEvent):
-                self.unknown[frame_id] = role_of(event)
-            return usual_mounting(event)
-
-
-def role_of(reading: Reading) -> str:
-    """What the instrument is to a mapper: sonar, dvl, imu, depth, odometry or fix."""
-    match reading:
-        case VelocityEvent():
-            return "dvl"
-        case ImuEvent():
-            return "imu"
-        case DepthEvent():
-            return "depth"
-        case PoseEvent():
-            return "odometry"
-        case FixEvent():
-            return "fix"
-    return "sonar"
-
-
-def usual_mounting(event: Reading) -> FloatArray:
-    """``T_base_sensor`` (4, 4) of an instrument at the origin that looks ahead, level, upright."""
-    columns = np.eye(4)
-    match event:
-        case VelocityEvent(is_z_down=True):
-            columns[:3, :3] = np.diag([1.0, -1.0, -1.0])
-        case ImageEvent(forward="z"):
-            columns[:3, :3] = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]
-    return columns
 
 
 def feed(mapper: VehicleMapper, event: SensorEvent, T_base_sensor: FloatArray) -> list[Submap]:

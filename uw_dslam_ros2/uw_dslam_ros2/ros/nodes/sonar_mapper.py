@@ -27,10 +27,8 @@ from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
 from uw_dslam_ros2.io.conventions import correct, correct_mounting
 from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed_runs
-from uw_dslam_ros2.io.readings import (
-    PINGS,
-    DepthEvent,
-)
+from uw_dslam_ros2.io.mountings import Mountings
+from uw_dslam_ros2.io.readings import PINGS, TransformEvent
 from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_to_msg,
     path_to_msg,
@@ -44,7 +42,7 @@ from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.frames import (
     WARNING_PERIOD_S,
     FrameBroadcaster,
-    Mounts,
+    Transforms,
     transform_to_msg,
 )
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
@@ -106,7 +104,15 @@ class SonarMapper(Node):
         )
         self._create_publishers()
         group = MutuallyExclusiveCallbackGroup()
-        self._mounts = Mounts(self, lambda: self._worker.post(self._drain), callback_group=group)
+        self._mountings = Mountings(self._base_frame)
+        self._mounting_problem = ""
+        self._told: set[str] = set()
+        self._transforms = Transforms(
+            self,
+            self._vehicle_id,
+            lambda event: self._worker.post(functools.partial(self._mount, event)),
+            callback_group=group,
+        )
         self._group = group
         self._inputs: dict[str, SensorInput] = {}
         self._subscriptions_of: dict[str, Subscription] = {}
@@ -316,24 +322,27 @@ class SonarMapper(Node):
         while (event := self._order.peek()) is not None:
             newest_ns = self._order.newest_ns or event.stamp_ns
             is_patient = newest_ns - event.stamp_ns < _MOUNT_PATIENCE_NS
-            if is_patient and not self._is_mounted(event):
+            if is_patient and not self._mountings.is_known(event):
                 return  # /tf_static is on its way
             self._feed(self._order.pop())
 
-    def _is_mounted(self, event: SensorEvent) -> bool:
-        if isinstance(event, DepthEvent):
-            return True
-        return self._mounts.lookup(self._base_frame, event.frame_id) is not None
+    def _mount(self, event: TransformEvent) -> None:
+        """Take a transform, and go on with what waited for it."""
+        self._mountings.add(event)
+        self._drain()
+
+    def _tell_mountings(self) -> None:
+        """Say so where a frame's place is not known, or a sonar looks up or down."""
+        findings = self._mountings.findings(self._vehicle_id)
+        self._mounting_problem = findings[0].sentence if findings else ""
+        for finding in findings:
+            if finding.sentence not in self._told:
+                self._told.add(finding.sentence)
+                self.get_logger().warning(finding.sentence)
 
     def _feed(self, event: SensorEvent) -> None:
-        frame_id = self._base_frame if isinstance(event, DepthEvent) else event.frame_id
-        T_base_sensor = self._mounts.lookup(self._base_frame, frame_id)
-        if T_base_sensor is None:
-            self._complain(
-                f"/tf_static does not say where {event.frame_id} is on {self._base_frame}; "
-                "its messages are left out"
-            )
-            return
+        T_base_sensor = self._mountings.of(event)
+        self._tell_mountings()
         try:
             mounting = correct_mounting(event, T_base_sensor, self._config.conventions)
             submaps = feed_runs(self._runs, event, mounting)
@@ -463,13 +472,13 @@ class SonarMapper(Node):
                     )
         values = {
             **dict(sorted(self._counts.items())),
-            "num_frames": self._mounts.num_frames,
+            "num_frames": self._mountings.num_frames,
             "num_late": self._order.num_late,
             "num_waiting": self._worker.num_waiting,
             **self._mapper_values,
         }
         num_pings = self._mapper_values.get("num_pings", 0)
-        problem = self._last_problem or self._problem
+        problem = self._last_problem or self._problem or self._mounting_problem
         severity, silence = self._silence()
         if conventions := self._watch.sentence:
             severity = max(severity, "warning", key=SEVERITIES.index)

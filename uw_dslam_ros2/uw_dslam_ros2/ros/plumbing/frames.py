@@ -1,4 +1,4 @@
-"""Frames: fixed mounts read from /tf_static, and our own transforms sent to /tf.
+"""Frames: fixed mounts read from /tf_static and /tf, and our own transforms sent to /tf.
 
 tf2_ros is not needed (and not everywhere installed): mounts never move, and what does move we
 send ourselves.
@@ -6,80 +6,81 @@ send ourselves.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from builtin_interfaces.msg import Time as TimeMsg
 from geometry_msgs.msg import TransformStamped
-from numpy.typing import NDArray
 from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.mounting import StaticFrames
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.messages import matrix_of_transform
+from uw_dslam_ros2.io.readings import TransformEvent
 from uw_dslam_ros2.ros.convert.core_types import quaternion_to_msg
 from uw_dslam_ros2.ros.plumbing.qos import STATIC_TF, TF
 
-__all__ = ["FrameBroadcaster", "Mounts", "transform_to_msg"]
+__all__ = ["FrameBroadcaster", "Transforms", "transform_to_msg"]
 
 WARNING_PERIOD_S = 5.0
+_MOVING = ("base_link", "base_footprint", "odom", "map")
 
 
-class Mounts:
-    """Fixed poses of instruments on a vehicle, as /tf_static tells them."""
+class Transforms:
+    """Fixed transforms of a vehicle as readings, from wherever they are sent.
+
+    That is ``/tf_static``, ``tf_static`` below the node's namespace, and ``/tf``, where many
+    drivers send their mountings again and again: of each frame there the first counts, and what
+    one of the others says counts for more.
+    """
 
     def __init__(
-        self, node: Node, on_change: Callable[[], None] | None = None, **kwargs: Any
+        self, node: Node, vehicle_id: str, take: Callable[[TransformEvent], None], **kwargs: Any
     ) -> None:
         self._node = node
-        self._frames = StaticFrames()
-        self._names: set[str] = set()
-        self._lock = threading.Lock()
-        self._on_change = on_change
-        node.create_subscription(TFMessage, "/tf_static", self._on_transforms, STATIC_TF, **kwargs)
+        self._vehicle_id = vehicle_id
+        self._take = take
+        self._heard: set[str] = set()
+        fixed = {"/tf_static", node.resolve_topic_name("tf_static")}
+        for topic in sorted(fixed):
+            node.create_subscription(
+                TFMessage, topic, lambda msg: self._on_transforms(msg, is_fixed=True), STATIC_TF,
+                **kwargs,
+            )  # fmt: skip
+        node.create_subscription(
+            TFMessage, "/tf", lambda msg: self._on_transforms(msg, is_fixed=False), TF, **kwargs
+        )
 
-    @property
-    def num_frames(self) -> int:
-        """Frames that were told."""
-        return len(self._names)
-
-    def _on_transforms(self, msg: TFMessage) -> None:
+    def _on_transforms(self, msg: TFMessage, *, is_fixed: bool) -> None:
         for transform in msg.transforms:
-            parent, child = (
-                transform.header.frame_id.lstrip("/"),
-                transform.child_frame_id.lstrip("/"),
-            )
+            child_frame_id = transform.child_frame_id
+            if not is_fixed and (child_frame_id in self._heard or _moves(child_frame_id)):
+                continue
             try:
                 T_parent_child = matrix_of_transform(transform.transform)
             except InvalidInputError as error:
                 self._node.get_logger().warning(
-                    f"transform {parent} -> {child} ignored: {error}",
+                    f"transform {transform.header.frame_id} -> {child_frame_id} ignored: {error}",
                     throttle_duration_sec=WARNING_PERIOD_S,
                 )
                 continue
-            with self._lock:
-                self._frames.add(parent, child, T_parent_child)
-                self._names.add(child)
-        if self._on_change is not None:
-            self._on_change()
+            self._heard.add(child_frame_id)
+            stamp = transform.header.stamp
+            self._take(
+                TransformEvent(
+                    self._vehicle_id,
+                    stamp.sec * 1_000_000_000 + stamp.nanosec,
+                    transform.header.frame_id,
+                    child_frame_id,
+                    T_parent_child,
+                )
+            )
 
-    def lookup(self, base_frame_id: str, frame_id: str) -> NDArray[np.float64] | None:
-        """``T_base_frame`` (4, 4), or None when nobody has told it (yet).
 
-        A message without a frame, or in the base frame, is taken as measured there.
-        """
-        frame_id = frame_id.lstrip("/")
-        if frame_id in ("", base_frame_id):
-            return np.eye(4)
-        with self._lock:
-            try:
-                return self._frames.lookup(base_frame_id, frame_id)
-            except InvalidInputError:
-                return None
+def _moves(frame_id: str) -> bool:
+    """Whether a frame is the vehicle's own or above it (REP 105): no instrument's."""
+    return frame_id.rpartition("/")[2] in _MOVING
 
 
 def transform_to_msg(

@@ -1,0 +1,161 @@
+"""Where the instruments of a vehicle sit, as transforms tell it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.core.mounting import StaticFrames, fan_tilt
+from uw_dslam_ros2.io.readings import (
+    DepthEvent,
+    FixEvent,
+    ImageEvent,
+    ImuEvent,
+    PoseEvent,
+    Reading,
+    TransformEvent,
+    VelocityEvent,
+)
+
+__all__ = ["Mountings", "role_of", "usual_mounting"]
+
+FloatArray = NDArray[np.float64]
+
+_NEEDS_NONE = DepthEvent | PoseEvent | FixEvent
+"""Readings that mean nearly the same wherever on the vehicle they are taken."""
+_NOTABLE_TILT_RAD = math.radians(10.0)  # shortens ranges by 1.5 %
+
+
+class Mountings:
+    """Where the instruments of a vehicle sit, as transforms tell it.
+
+    Parameters
+    ----------
+    base_frame_id
+        Frame of the vehicle's body.
+
+    Attributes
+    ----------
+    unknown : dict[str, str]
+        Frames that no transform leads from to the body -> kind of reading. They are taken to sit
+        at its origin, with the axes that their message's definition says.
+    tilted : dict[str, float]
+        Frames of sonars that point notably up or down -> by how much [rad].
+    """
+
+    def __init__(self, base_frame_id: str) -> None:
+        self._base_frame_id = base_frame_id
+        self._frames = StaticFrames()
+        self._known: dict[tuple[type, str], FloatArray] = {}
+        self.unknown: dict[str, str] = {}
+        self.tilted: dict[str, float] = {}
+
+    def add(self, event: TransformEvent) -> None:
+        """Take a transform."""
+        self._frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
+        self._known.clear()
+        self.unknown.clear()
+
+    @property
+    def num_frames(self) -> int:
+        """Frames whose place was told."""
+        return len(self._frames)
+
+    def is_known(self, event: Reading) -> bool:
+        """Whether `of` would give what transforms tell, or was asked in vain before."""
+        frame_id = _frame_of(event)
+        if isinstance(event, _NEEDS_NONE) or self._is_base(frame_id) or frame_id in self.unknown:
+            return True
+        if (type(event), frame_id) in self._known:
+            return True
+        try:
+            self._frames.lookup(self._base_frame_id, frame_id)
+        except InvalidInputError:
+            return False
+        return True
+
+    def of(self, event: Reading) -> FloatArray:
+        """``T_base_sensor`` (4, 4) of the instrument that said this."""
+        frame_id = _frame_of(event)
+        key = type(event), frame_id
+        if key not in self._known:
+            mounting = self._known[key] = self._mounting(event, frame_id)
+            if role_of(event) == "sonar":
+                forward = event.forward if isinstance(event, ImageEvent) else "x"
+                if (tilt_rad := fan_tilt(mounting, forward)) > _NOTABLE_TILT_RAD:
+                    self.tilted[frame_id] = tilt_rad
+        return self._known[key]
+
+    def _mounting(self, event: Reading, frame_id: str) -> FloatArray:
+        if self._is_base(frame_id):
+            return np.eye(4)
+        try:
+            return self._frames.lookup(self._base_frame_id, frame_id)
+        except InvalidInputError:
+            if not isinstance(event, _NEEDS_NONE):
+                self.unknown[frame_id] = role_of(event)
+            return usual_mounting(event)
+
+    def _is_base(self, frame_id: str) -> bool:
+        return frame_id.strip("/") in ("", self._base_frame_id.strip("/"))
+
+    def findings(self, vehicle_id: str) -> list[Finding]:
+        """What to tell of frames that are unknown, and of sonars that point up or down."""
+        unknown = [
+            Finding(
+                "no_mounting",
+                "velocity" if word == "dvl" else word,
+                f"no transform says where its frame {frame_id!r} sits; it is taken to sit "
+                "at the origin, level and looking ahead",
+                vehicle_id=vehicle_id,
+            )
+            for frame_id, word in sorted(self.unknown.items())
+        ]
+        tilted = [
+            Finding(
+                "sonar_tilted",
+                "sonar",
+                f"its frame {frame_id!r} points {math.degrees(tilt_rad):.0f} degrees up or down; "
+                "each beam is projected by its middle, but how high an echo lies in the beam is "
+                "not known, so that walls may be some per cent off: mount it level where a true "
+                "map is wanted",
+                vehicle_id=vehicle_id,
+            )
+            for frame_id, tilt_rad in sorted(self.tilted.items())
+        ]
+        return unknown + tilted
+
+
+def _frame_of(event: Reading) -> str:
+    return event.child_frame_id if isinstance(event, PoseEvent) else event.frame_id
+
+
+def role_of(reading: Reading) -> str:
+    """What the instrument is to a mapper: sonar, dvl, imu, depth, odometry or fix."""
+    match reading:
+        case VelocityEvent():
+            return "dvl"
+        case ImuEvent():
+            return "imu"
+        case DepthEvent():
+            return "depth"
+        case PoseEvent():
+            return "odometry"
+        case FixEvent():
+            return "fix"
+    return "sonar"
+
+
+def usual_mounting(event: Reading) -> FloatArray:
+    """``T_base_sensor`` (4, 4) of an instrument at the origin that looks ahead, level, upright."""
+    columns = np.eye(4)
+    match event:
+        case VelocityEvent(is_z_down=True):
+            columns[:3, :3] = np.diag([1.0, -1.0, -1.0])
+        case ImageEvent(forward="z"):
+            columns[:3, :3] = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]
+    return columns
