@@ -15,6 +15,8 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging.answers import Answer, Query
+from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
     RegistrationResult,
@@ -22,7 +24,7 @@ from uw_dslam_ros2.core.registration.result import (
     Verdict,
 )
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_from_msg,
     occupancy_to_msg,
@@ -32,6 +34,7 @@ from uw_dslam_ros2.ros.convert.core_types import (
     submap_from_msg,
     submap_to_msg,
 )
+from uw_dslam_ros2.ros.convert.merging import answer_from_msg, answer_to_msg
 from uw_dslam_ros2.ros.convert.registration import (
     options_from_msg,
     options_to_msg,
@@ -327,3 +330,58 @@ def test_long_path_is_thinned_between_its_ends():
     assert len(xs) == 10
     assert (xs[0], xs[-1]) == (0.0, 999.0)
     assert xs == sorted(set(xs))
+
+
+# --- answers of the queue --------------------------------------------------------------------
+
+
+def group(vehicle_id, *places):
+    members = {SubmapId(vehicle_id, 7, i): place for i, place in enumerate(places)}
+    return SubmapGroup(SubmapId(vehicle_id, 7, 1), members, b"key")
+
+
+@pytest.mark.parametrize("motion", [SE2(1.0, -2.0, 0.5), None])
+@pytest.mark.parametrize("prior", [PriorWindow(SE2(3.0, 4.0, 0.1), 2.0, 0.25), None])
+def test_an_answer_comes_back_as_it_went(motion, prior):
+    source = group("auv_1", SE2(-1.0, 0.0, 0.1), SE2())
+    target = group("auv_2", SE2(0.0, 5.0, 0.0), SE2(), SE2(2.0, 0.0, -0.3))
+    numbers = {"score": 0.5, "lower_bound": 0.5, "upper_bound": 0.505, "is_certified": 1.0}
+    numbers |= {"num_boxes": 12.0, "num_source_points": 3.0, "num_target_points": 4.0}
+    covariance = np.diag([0.1, 0.2, 0.3]) if motion else np.full((3, 3), np.nan)
+    verdict = Verdict.ACCEPTED if motion else Verdict.TOO_FEW_FEATURES
+    probability = 0.9 if motion else 0.0
+    sent = Answer(
+        Query(source, target, prior), verdict, "why", motion, covariance, probability, numbers
+    )
+    msg = answer_to_msg(sent, True)
+    assert msg.answer.gap == pytest.approx(0.005 / 0.505)
+    assert (msg.source_reference, msg.target_reference) == (1, 1)
+    found, is_used = answer_from_msg(msg)
+    assert is_used
+    assert (found.verdict, found.reason, found.T_target_source) == (verdict, sent.why, motion)
+    assert (found.probability, found.numbers) == (probability, numbers)
+    np.testing.assert_array_equal(found.covariance, covariance)
+    for name in ("source", "target"):
+        one, other = getattr(sent.query, name), getattr(found.query, name)
+        assert (one.reference, one.T_reference_submap) == (
+            other.reference,
+            other.T_reference_submap,
+        )
+    assert (found.query.prior is None) == (prior is None)
+    if prior:
+        assert found.query.prior == prior
+
+
+def test_answers_that_point_nowhere_are_refused():
+    sent = Answer(
+        Query(group("a", SE2(), SE2()), group("b", SE2(), SE2())),
+        Verdict.ACCEPTED, "", SE2(), np.eye(3), 0.9,
+    )  # fmt: skip
+    for field, value, said in (
+        ("source_reference", 2, "source_reference is 2"),
+        ("answer", Registration(), "answer.verdict is 0"),
+    ):
+        msg = answer_to_msg(sent, False)
+        setattr(msg, field, value)
+        with pytest.raises(InvalidInputError, match=said):
+            answer_from_msg(msg)

@@ -57,6 +57,7 @@ SERVICES = {
     "/registration_server/register_point_sets": "uw_dslam_msgs/srv/RegisterPointSets",
     "/map_queue_manager/save_map": "uw_dslam_msgs/srv/SaveMap",
     "/map_queue_manager/list_submaps": "uw_dslam_msgs/srv/ListSubmaps",
+    "/map_queue_manager/list_registrations": "uw_dslam_msgs/srv/ListRegistrations",
     "/map_queue_manager/get_submap": "uw_dslam_msgs/srv/GetSubmap",
     "/map_queue_manager/withdraw_submap": "uw_dslam_msgs/srv/WithdrawSubmap",
     "/map_queue_manager/restore_submap": "uw_dslam_msgs/srv/RestoreSubmap",

@@ -1,9 +1,10 @@
-"""``view SESSION``: a saved merge in the browser."""
+"""``view [FOLDER]``: a saved merge, or the running graph, in the browser."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -19,36 +20,53 @@ __all__ = ["main"]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Serve until interrupted."""
-    args = _parser().parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    cut = words.index("--ros-args") if "--ros-args" in words else len(words)
+    args = _parser().parse_args(words[:cut])
+    if args.folder is None:
+        return _follow_graph(args, words[cut:])
     return run_command("view", lambda: _run(args))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_for(
         "view",
-        "Show a saved merge in the browser: the global map, vehicles, submaps, constraints, and\n"
-        "each registration with both maps laid on each other.",
+        "Show a merge in the browser: the global map, vehicles, submaps, constraints, and each\n"
+        "registration with both maps laid on each other. Without FOLDER it follows the\n"
+        "map_queue_manager of the running graph; its parameters may come after --ros-args.",
         "view result",
     )
     parser.add_argument(
-        "session",
+        "folder",
         type=Path,
+        nargs="?",
         metavar="FOLDER",
         help="result of offline or demo, or a session that map_queue_manager saved",
     )
     parser.add_argument(
         "--address",
         default="127.0.0.1",
-        help="where to listen; another than this machine's own "
-        "(127.0.0.1) asks browsers for a token",
+        help="where to listen; another than this machine's own (127.0.0.1) asks browsers for a "
+        "token",
     )
     parser.add_argument("--port", type=int, default=8080, help="0: any that is free")
     parser.add_argument("--token", default="", help="drawn at random where one is needed")
     return parser
 
 
+def _follow_graph(args: argparse.Namespace, ros_args: Sequence[str]) -> int:
+    """Become the node, which needs ROS; a saved merge does not."""
+    settings = [f"{name}:={getattr(args, name)}" for name in ("address", "port")]
+    if args.token:
+        settings.append(f"token:={args.token}")
+    options = [word for setting in settings for word in ("-p", setting)]
+    module = "uw_dslam_ros2.ros.nodes.view"
+    tail = ros_args[1:] if ros_args else []
+    os.execv(sys.executable, [sys.executable, "-m", module, "--ros-args", *options, *tail])
+
+
 def _run(args: argparse.Namespace) -> int:
-    folder = args.session
+    folder = args.folder
     holder = folder / SESSION_FOLDER if (folder / SESSION_FOLDER).is_dir() else folder
     source = QueueSource(folder.resolve().name, load_session(holder))
     server = ViewServer(source, args.address, args.port, args.token)

@@ -10,7 +10,7 @@ from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfi
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
 from uw_dslam_ros2.view.showing import Register, Showing
 
-__all__ = ["QueueSource"]
+__all__ = ["QueueSource", "register_by_engine"]
 
 
 class QueueSource:
@@ -29,11 +29,12 @@ class QueueSource:
         return {"is_live": False}
 
     def register(self) -> Register:
-        """The engine itself, with its defaults."""
+        """The engine itself."""
+        return register_by_engine
 
-        def work(
-            source: OccupancyMap, target: OccupancyMap, prior: PriorWindow | None
-        ) -> RegistrationResult:
-            return register_grids(source, target, GridRegistrationConfig(), prior=prior)
 
-        return work
+def register_by_engine(
+    source: OccupancyMap, target: OccupancyMap, prior: PriorWindow | None
+) -> RegistrationResult:
+    """Register in this process, with the defaults."""
+    return register_grids(source, target, GridRegistrationConfig(), prior=prior)

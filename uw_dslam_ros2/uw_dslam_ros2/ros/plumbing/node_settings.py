@@ -14,6 +14,7 @@ __all__ = [
     "MapQueueManagerConfig",
     "RegistrationServerConfig",
     "SonarMapperConfig",
+    "ViewConfig",
     "names_of_all_nodes",
 ]
 
@@ -134,11 +135,25 @@ class BagPlayerConfig(Config):
     )
 
 
+@dataclass(frozen=True, slots=True)
+class ViewConfig(Config):
+    """Settings of the view of a running graph."""
+
+    manager: str = setting("/map_queue_manager", doc="the manager's node name, with its namespace")
+    address: str = setting(
+        "127.0.0.1",
+        doc="where the page is served; another than this machine's own asks for a token",
+    )
+    port: int = setting(8080, 0, 65535, "of the page; 0: any that is free", is_basic=True)
+    token: str = setting("", doc="what a browser must know; empty: drawn where one is needed")
+
+
 NODE_CONFIGS: dict[str, type[Config]] = {
     "sonar_mapper": SonarMapperConfig,
     "registration_server": RegistrationServerConfig,
     "map_queue_manager": MapQueueManagerConfig,
     "bag_player": BagPlayerConfig,
+    "view": ViewConfig,
 }
 
 

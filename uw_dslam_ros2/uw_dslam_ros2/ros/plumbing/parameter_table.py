@@ -33,6 +33,7 @@ GROUPS: dict[str, tuple[tuple[str, type[Config]], ...]] = {
     ),
     "map_queue_manager": (("queue", MapQueueConfig), ("maps", GrowingMapConfig)),
     "bag_player": (),
+    "view": (),
 }
 """Groups of parameters of each node, beside its own."""
 

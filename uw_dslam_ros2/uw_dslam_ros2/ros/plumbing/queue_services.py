@@ -12,6 +12,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 from uw_dslam_msgs.srv import (
     GetSubmap,
+    ListRegistrations,
     ListSubmaps,
     LoadSession,
     RestoreSubmap,
@@ -27,7 +28,7 @@ from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, has_session
 from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
-from uw_dslam_ros2.ros.convert.merging import record_to_msg
+from uw_dslam_ros2.ros.convert.merging import answer_to_msg, record_to_msg
 from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 
@@ -76,6 +77,7 @@ class QueueServices:
             (SaveMap, "save_map", self._save_map),
             (ListSubmaps, "list_submaps", self._list_submaps),
             (GetSubmap, "get_submap", self._get_submap),
+            (ListRegistrations, "list_registrations", self._list_registrations),
             (WithdrawSubmap, "withdraw_submap", self._withdraw_submap),
             (RestoreSubmap, "restore_submap", self._restore_submap),
             (SaveSession, "save_session", self._save_session),
@@ -132,6 +134,19 @@ class QueueServices:
                 return
         response.result = response.NOT_FOUND
         response.message = _not_found(submap_id)
+
+    def _list_registrations(
+        self, request: ListRegistrations.Request, response: ListRegistrations.Response
+    ) -> None:
+        response.registrations = [
+            answer_to_msg(answer, is_used)
+            for answer, is_used in self._owner.queue.answers()
+            if request.vehicle_id == ""
+            or any(
+                i.vehicle_id == request.vehicle_id
+                for i in (*answer.query.source.ids, *answer.query.target.ids)
+            )
+        ]
 
     def _submap_id(self, request: Any) -> SubmapId:
         """Which submap is meant; without a run that of the vehicle's newest one."""

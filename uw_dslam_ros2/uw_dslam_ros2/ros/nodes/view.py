@@ -1,0 +1,201 @@
+"""The view of a running graph: asks the manager, shows the page; decides nothing itself."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from uw_dslam_msgs.msg import MergeStatus
+from uw_dslam_msgs.srv import GetSubmap, ListRegistrations
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.submap import Submap, SubmapId, track_name
+from uw_dslam_ros2.ros.convert.core_types import submap_from_msg
+from uw_dslam_ros2.ros.convert.merging import (
+    answer_from_msg,
+    constraint_from_msg,
+    record_from_msg,
+)
+from uw_dslam_ros2.ros.plumbing.node_settings import ViewConfig
+from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SERVICES
+from uw_dslam_ros2.ros.plumbing.running import run_node
+from uw_dslam_ros2.view.queue_source import register_by_engine
+from uw_dslam_ros2.view.server import ViewServer
+from uw_dslam_ros2.view.showing import Register, Showing
+
+__all__ = ["View", "main"]
+
+_LEAST_PERIOD_S = 0.2  # between two states that are shown
+_ANSWER_WITHIN_S = 20.0
+_SILENT_S = 10.0
+"""A manager that says nothing for this long is told; it speaks once a second."""
+
+
+class View(Node):
+    """Follows a manager's status and fetches what is new.
+
+    Callbacks only note what came; one thread asks the manager, another serves pages.
+    """
+
+    num_threads = 4
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("view", **kwargs)
+        self._config = declare_config(self, ViewConfig)
+        refuse_unknown_parameters(self)
+        manager = "/" + self._config.manager.strip("/")
+        self.title = f"{manager} on this graph"
+        group = ReentrantCallbackGroup()
+        self._get_submap = self._client(GetSubmap, f"{manager}/get_submap", group)
+        self._list_registrations = self._client(
+            ListRegistrations, f"{manager}/list_registrations", group
+        )
+        self._submaps: dict[SubmapId, Submap] = {}
+        self._answers: list[tuple[Answer, bool]] = []
+        self._num_answers = -1
+        self._showing = Showing([], [])
+        self._status: MergeStatus | None = None
+        self._heard_s = float("-inf")
+        self._changed_s: dict[str, float] = {}
+        self._troubles: dict[str, str] = {}
+        self._is_new, self._is_stopped = threading.Event(), threading.Event()
+        self._server = ViewServer(
+            self, self._config.address, self._config.port, self._config.token
+        )
+        self._loop = asyncio.new_event_loop()
+        self._threads = [
+            threading.Thread(target=self._loop.run_forever, name="pages", daemon=True),
+            threading.Thread(target=self._follow, name="follow", daemon=True),
+        ]
+        self._threads[0].start()
+        self.url = asyncio.run_coroutine_threadsafe(self._server.start(), self._loop).result()
+        self.get_logger().info(f"open {self.url} in a browser")
+        self._threads[1].start()
+        namespace = manager.rsplit("/", 1)[0]
+        self.create_subscription(
+            MergeStatus,
+            f"{namespace}/merge_status",
+            self._on_status,
+            LATCHED,
+            callback_group=group,
+        )
+        self.create_subscription(
+            DiagnosticArray, "/diagnostics", self._on_diagnostics, DEFAULT, callback_group=group
+        )
+
+    def showing(self) -> Showing:
+        """The newest state."""
+        return self._showing
+
+    def status(self) -> dict[str, Any]:
+        """Ages and what is wrong."""
+        now_s = time.monotonic()
+        notes = [f"{name}: {text}" for name, text in sorted(self._troubles.items())]
+        if now_s - self._heard_s > _SILENT_S:
+            notes.insert(0, f"{self._config.manager} is not heard")
+        status = self._status
+        return {
+            "is_live": True,
+            "message": "" if status is None else status.message,
+            "num_servers": 0 if status is None else int(status.num_servers),
+            "num_in_flight": 0 if status is None else int(status.num_in_flight),
+            "ages": {name: now_s - since_s for name, since_s in self._changed_s.items()},
+            "notes": notes,
+        }
+
+    def register(self) -> Register:
+        """The engine itself: servers are there for the merge."""
+        return register_by_engine
+
+    def stop(self) -> None:
+        """End both threads."""
+        self._is_stopped.set()
+        self._is_new.set()
+        asyncio.run_coroutine_threadsafe(self._server.stop(), self._loop).result(1.0)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+
+    def _client(self, service_type: Any, name: str, group: ReentrantCallbackGroup) -> Any:
+        return self.create_client(service_type, name, qos_profile=SERVICES, callback_group=group)
+
+    def _on_status(self, msg: MergeStatus) -> None:
+        self._heard_s = time.monotonic()
+        self._status = msg
+        self._is_new.set()
+
+    def _on_diagnostics(self, msg: DiagnosticArray) -> None:
+        for status in msg.status:
+            if status.level == DiagnosticStatus.OK:
+                self._troubles.pop(status.name, None)
+            else:
+                self._troubles[status.name] = status.message
+
+    def _follow(self) -> None:
+        while not self._is_stopped.is_set():
+            self._is_new.wait()
+            self._is_new.clear()
+            status = self._status
+            if self._is_stopped.is_set() or status is None:
+                continue
+            try:
+                self._show(status)
+            except (InvalidInputError, TimeoutError) as error:
+                self.get_logger().warning(f"cannot show the newest state: {error}")
+            self._is_stopped.wait(_LEAST_PERIOD_S)
+
+    def _show(self, status: MergeStatus) -> None:
+        records = []
+        for info in status.submaps:
+            submap_id = SubmapId(info.vehicle_id, int(info.run_id), int(info.sequence))
+            held = self._submaps.get(submap_id)
+            if held is None or held.revision != info.revision:
+                held = self._fetch(submap_id)
+                self._submaps[submap_id] = held
+                self._changed_s[track_name(submap_id.track)] = time.monotonic()
+            records.append(record_from_msg(info, held))
+        if status.num_registrations != self._num_answers:
+            response = self._ask(self._list_registrations, ListRegistrations.Request())
+            self._answers = [answer_from_msg(msg) for msg in response.registrations]
+            self._num_answers = status.num_registrations
+        constraints = [constraint_from_msg(msg) for msg in status.constraints]
+        showing = Showing(records, constraints, self._answers, self._showing)
+        if showing.version != self._showing.version:
+            self._showing = showing
+            asyncio.run_coroutine_threadsafe(self._server.notify(), self._loop)
+
+    def _fetch(self, submap_id: SubmapId) -> Submap:
+        request = GetSubmap.Request(
+            vehicle_id=submap_id.vehicle_id,
+            run_id=submap_id.run_id,
+            sequence=submap_id.sequence,
+        )
+        response = self._ask(self._get_submap, request)
+        if response.result != response.DONE:
+            raise InvalidInputError(response.message)
+        return submap_from_msg(response.submap)
+
+    def _ask(self, client: Any, request: Any) -> Any:
+        future, is_done = client.call_async(request), threading.Event()
+        future.add_done_callback(lambda _: is_done.set())
+        deadline_s = time.monotonic() + _ANSWER_WITHIN_S
+        while not is_done.wait(0.2):
+            if time.monotonic() > deadline_s or self._is_stopped.is_set():
+                client.remove_pending_request(future)
+                raise TimeoutError(f"{client.srv_name} does not answer")
+        return future.result()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node("view", View, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
