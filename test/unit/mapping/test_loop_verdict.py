@@ -115,9 +115,9 @@ def test_no_information_that_is_not_finite_closes_a_loop():
 
 def test_settings_of_the_registration_reach_the_engine(tmp_path, monkeypatch):
     path = tmp_path / "settings.yaml"
-    path.write_text("mapper: {loop: {registration: {min_probability: 0.9, max_conflict: 0.1}}}")
+    path.write_text("mapper: {loop: {registration: {max_false_accept: 0.1, min_overlap: 0.2}}}")
     config = SettingsFile(path).section(VehicleMapperConfig, "mapper", "/auv_1/sonar_mapper")
-    expected = LoopRegistrationConfig(min_probability=0.9, max_conflict=0.1)
+    expected = LoopRegistrationConfig(max_false_accept=0.1, min_overlap=0.2)
     assert config.loop.registration == expected
     assert expected.max_boxes == 20_000
     asked = []

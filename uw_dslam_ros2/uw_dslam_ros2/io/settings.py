@@ -57,7 +57,16 @@ REMOVED = {
     "mapper.particles.min_effective_share": "it is always 0.5",
     "mapper.particles.max_points": "it is always 250",
     "points.min_probability": "it is points.min_posterior now",
-    "registration.max_slide_share": "the standard deviation along a wall decides, in metres",
+    **{
+        f"{group}.{name}": text
+        for group in ("registration", "mapper.loop.registration")
+        for name, text in (
+            ("min_probability", f"write 1 less it as {group}.max_false_accept"),
+            ("max_conflict", "it is always 0.4"),
+            ("max_rival_probability", "it is always 0.8"),
+            ("max_slide_share", "the standard deviation along a wall decides, in metres"),
+        )
+    },
     "queue.log_odds_max": "it is always 8",
     "queue.num_neighbours": "it is always 1",
     "queue.max_checks": "it is always 3",

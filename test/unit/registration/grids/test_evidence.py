@@ -139,7 +139,7 @@ def test_the_same_lead_settles_large_maps_and_leaves_small_ones_open():
     for num_walls in (150, 3000):
         best = replace(GOOD.best, agreement=_agreement(agreement=0.96, num_walls=num_walls))
         rival = replace(best, agreement=replace(best.agreement, agreement=0.92))
-        config = GridRegistrationConfig(min_probability=0.0)
+        config = GridRegistrationConfig(max_false_accept=1.0)
         verdicts.append(decide(replace(GOOD, best=best, rivals=(rival,)), config)[0])
     assert verdicts == [Verdict.AMBIGUOUS, Verdict.ACCEPTED]
 

@@ -155,11 +155,9 @@ def test_the_papers_points_stay_selectable(harbour):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("min_probability", 0.9),
-        ("max_conflict", 0.2),
+        ("max_false_accept", 0.1),
         ("min_overlap", 0.3),
         ("is_proof_required", True),
-        ("max_rival_probability", 0.5),
         ("free_penalty", 0.1),
     ],
 )

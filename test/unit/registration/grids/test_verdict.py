@@ -16,7 +16,13 @@ from uw_dslam_ros2.core.registration.grids.probability import (
     PoseEvidence,
     probability_of,
 )
-from uw_dslam_ros2.core.registration.grids.verdict import _RULES, Proof, _Case, decide
+from uw_dslam_ros2.core.registration.grids.verdict import (
+    _RULES,
+    MOST_RIVAL_PROBABILITY,
+    Proof,
+    _Case,
+    decide,
+)
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.registration.rules import at_least, at_most, first_that_applies
 
@@ -48,8 +54,7 @@ def random_case(rng):
     if rng.random() < 0.5:
         config = replace(
             config,
-            min_probability=rng.random(), max_conflict=rng.random(),
-            min_overlap=0.4 * rng.random(), max_rival_probability=rng.random(),
+            max_false_accept=rng.random(), min_overlap=0.4 * rng.random(),
         )  # fmt: skip
     proof = Proof(
         is_complete=bool(rng.random() < 0.8), is_optimum=bool(rng.random() < 0.8),
@@ -76,31 +81,31 @@ SENTENCES = {
     "share of the common walls": (
         Verdict.CONTRADICTED,
         lambda e, _: e.best.agreement.conflict,
-        lambda c, p: c.max_conflict * (1.0 if p >= c.min_probability else 0.6),
+        lambda c, p: 0.4 if p >= 1.0 - c.max_false_accept else 0.24,
         "most",
     ),
     "another pose agrees as well": (
         Verdict.AMBIGUOUS,
         None,  # of a rival
-        lambda c, _: c.max_rival_probability,
+        lambda _c, _p: MOST_RIVAL_PROBABILITY,
         "most",
     ),
     "another pose agrees about as well": (
         Verdict.AMBIGUOUS,
         lambda _, p: p,
-        lambda c, _: c.min_probability,
+        lambda c, _: 1.0 - c.max_false_accept,
         "least",
     ),
     "what agrees are a few straight walls": (
         Verdict.AMBIGUOUS,
         lambda _, p: p,
-        lambda c, _: c.min_probability,
+        lambda c, _: 1.0 - c.max_false_accept,
         "least",
     ),
     "right with probability": (
         Verdict.IMPROBABLE,
         lambda _, p: p,
-        lambda c, _: c.min_probability,
+        lambda c, _: 1.0 - c.max_false_accept,
         "least",
     ),
 }
@@ -149,14 +154,14 @@ def test_what_is_accepted_breaks_no_limit_and_the_name_fits_the_cause(rng):
         if verdict is Verdict.NOT_ENOUGH_OVERLAP:
             assert agreement.overlap < config.min_overlap
         if verdict is Verdict.IMPROBABLE:
-            assert probability < config.min_probability
+            assert probability < 1.0 - config.max_false_accept
         if verdict is not Verdict.ACCEPTED:
             continue
         num_accepted += 1
         assert agreement.overlap >= config.min_overlap
-        assert agreement.conflict <= config.max_conflict
+        assert agreement.conflict <= 0.4
         assert evidence.deviation_m <= 0.15 * evidence.extent_m
-        assert probability >= config.min_probability
+        assert probability >= 1.0 - config.max_false_accept
         assert not proof.is_cancelled
         assert not config.is_proof_required or (proof.is_complete and proof.is_optimum)
     assert num_accepted > 300
@@ -203,7 +208,7 @@ def test_no_number_of_a_proof_that_is_not_finite_is_passed(name, bad):
 
 
 def refused(evidence, proof, bad):
-    config = GridRegistrationConfig(min_probability=0.0)
+    config = GridRegistrationConfig(max_false_accept=1.0)
     assert decide(GOOD, config, proof=PROVEN)[0] is Verdict.ACCEPTED
     verdict, reason, probability = decide(evidence, config, proof=proof)
     assert verdict is Verdict.TOO_FEW_FEATURES

@@ -39,7 +39,7 @@ from uw_dslam_ros2.core.registration.grids.probability import (
     rival_probability,
 )
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.verdict import decide
+from uw_dslam_ros2.core.registration.grids.verdict import MOST_RIVAL_PROBABILITY, decide
 from uw_dslam_ros2.core.registration.result import Verdict
 
 FloatArray = NDArray[np.float64]
@@ -121,8 +121,7 @@ def _fitted(trials: list[Trial]) -> VerdictModels:
             weights.append(trial.weight * (1.0 if one.score == highest else _OTHER_WEIGHT))
     pose = _logistic(features, is_right, weights)
     alone = VerdictModels(pose, (0.0, 1.0, 0.0))
-    limit = GridRegistrationConfig().max_rival_probability
-    left = [t for t in trials if rival_probability(t.evidence, alone) <= limit]
+    left = [t for t in trials if rival_probability(t.evidence, alone) <= MOST_RIVAL_PROBABILITY]
     match = _logistic(
         [match_features(t.evidence, pose) for t in left],
         [t.is_right for t in left],

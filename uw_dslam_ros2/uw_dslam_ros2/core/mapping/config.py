@@ -115,7 +115,9 @@ class LoopRegistrationConfig(GridRegistrationConfig):
     is_proof_required: bool = setting(
         False, doc="refuse a match, however probable, that is not the proven optimum to the gap"
     )
-    min_probability: float = setting(0.75, 0.0, 1.0, "least probability of an accepted match")
+    max_false_accept: float = setting(
+        0.25, 0.0, 1.0, "most probability that an accepted match is wrong"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,12 +49,8 @@ class GridRegistrationConfig(Config):
     )
     min_wall_cells: int = setting(25, 1, 100000, "fewer wall cells in a map are too few")
     min_overlap: float = setting(0.1, 0.0, 1.0, "least common seen area, share of the smaller")
-    max_conflict: float = setting(0.4, 0.0, 1.0, "walls on free space, share of common walls")
-    max_rival_probability: float = setting(
-        0.8, 0.0, 1.0, "a rival that by itself is more probable than that makes it ambiguous"
-    )
-    min_probability: float = setting(
-        0.75, 0.0, 1.0, "least probability of an accepted match", is_basic=True
+    max_false_accept: float = setting(
+        0.25, 0.0, 1.0, "most probability that an accepted match is wrong", is_basic=True
     )
 
     def __post_init__(self) -> None:

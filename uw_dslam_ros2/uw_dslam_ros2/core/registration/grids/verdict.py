@@ -19,9 +19,12 @@ from uw_dslam_ros2.core.registration.grids.probability import (
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.registration.rules import Rule, at_least, at_most, first_that_applies
 
-__all__ = ["Proof", "decide"]
+__all__ = ["MOST_RIVAL_PROBABILITY", "Proof", "decide"]
 
-_IMPROBABLE_CONFLICT = 0.6  # of the conflict allowed, where a match is not probable either
+_MOST_CONFLICT = 0.4  # of the common walls lie on free space
+_IMPROBABLE_CONFLICT = 0.24  # where a match is not probable either, that is why
+MOST_RIVAL_PROBABILITY = 0.8
+"""A rival that by itself is more probable than that makes a match ambiguous."""
 _LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
 _MOST_DEVIATION = 0.15  # of a pose in its weakest direction, share of the walls' extent
 _DOUBTED = 0.5  # most probability left to a pose that the maps do not tell from others
@@ -63,10 +66,9 @@ class _Case:
         self.agreement = evidence.best.agreement
         self.not_finite = next(_not_finite(evidence, proof), "")
         self.probability = 0.0 if self.not_finite else probability_of(evidence, models)
-        self.is_probable = self.probability >= config.min_probability
-        self.max_conflict = config.max_conflict
-        if not self.is_probable:
-            self.max_conflict *= _IMPROBABLE_CONFLICT
+        self.least = 1.0 - config.max_false_accept
+        self.is_probable = self.probability >= self.least
+        self.max_conflict = _MOST_CONFLICT if self.is_probable else _IMPROBABLE_CONFLICT
 
     @property
     def most_deviation_m(self) -> float:
@@ -81,7 +83,7 @@ class _Case:
     @property
     def is_convincing(self) -> bool:
         """Rivals only matter to a match that would be accepted without them."""
-        return self.alone >= self.config.min_probability
+        return self.alone >= self.least
 
     @property
     def rival(self) -> float:
@@ -95,12 +97,12 @@ class _Case:
         detailed = replace(agreement, num_detail=max(agreement.num_detail, ENOUGH_DETAIL))
         richer = replace(self.evidence, best=replace(best, agreement=detailed))
         is_like = agreement.agreement >= _LIKE_SHARE
-        return is_like and probability_of(richer, self.models) >= self.config.min_probability
+        return is_like and probability_of(richer, self.models) >= self.least
 
     @property
     def improbable(self) -> str:
         """The probability that is too small."""
-        text = at_least(self.probability, self.config.min_probability, ".2f")
+        text = at_least(self.probability, self.least, ".2f")
         return f"right with probability {text}"
 
     @property
@@ -169,11 +171,11 @@ _RULES: tuple[Rule[_Case, Verdict], ...] = (
         ),
     ),
     Rule(
-        lambda c: c.is_convincing and c.rival > c.config.max_rival_probability,
+        lambda c: c.is_convincing and c.rival > MOST_RIVAL_PROBABILITY,
         Verdict.AMBIGUOUS,
         lambda c: (
             "another pose agrees as well where it overlaps: if this one were not there, it would "
-            f"be right with probability {at_most(c.rival, c.config.max_rival_probability, '.2f')}"
+            f"be right with probability {at_most(c.rival, MOST_RIVAL_PROBABILITY, '.2f')}"
             f"; best score of another: {c.evidence.rival_share:.0%} of this one's"
         ),
         most_probability=_DOUBTED,
