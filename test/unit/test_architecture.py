@@ -17,7 +17,7 @@ CLOSED = {
     "core": {"io", "sim", "view", "ros", "cli"},
     "io": {"sim", "view", "ros", "cli"},
     "sim": {"view", "ros", "cli"},
-    "view": {"io", "sim", "ros", "cli"},
+    "view": {"sim", "ros", "cli"},
     "ros": {"sim", "cli"},
     "ros.convert": {"ros.plumbing", "ros.nodes"},
     "ros.plumbing": {"ros.nodes"},

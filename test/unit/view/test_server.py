@@ -1,14 +1,19 @@
 """The server of the view, asked as a browser asks it, and as others should not."""
 
 import asyncio
+import io
 import itertools
 import json
+import zipfile
 
 import aiohttp
+import numpy as np
 import pytest
 from unit.cli import missions
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
 from uw_dslam_ros2.view.queue_source import QueueSource
 from uw_dslam_ros2.view.server import ViewServer, is_loopback
 
@@ -70,6 +75,31 @@ def test_tiles_and_pairs_are_pictures(source):
     assert [status for status, _, _ in found] == [200, 204, 200, 200]
     assert found[0][2].startswith(b"\x89PNG")
     assert found[3][2].startswith(b"\x89PNG")
+
+
+def test_the_archive_holds_what_is_shown(source, tmp_path):
+    one, other = answers(source, ["/api/export.zip"] * 2)
+    assert one[2] == other[2]  # the same state, the same bytes
+    with zipfile.ZipFile(io.BytesIO(one[2])) as archive:
+        archive.extractall(tmp_path)
+    groups = source.showing().scene()["groups"]
+    folders = sorted(path.name for path in tmp_path.iterdir() if path.is_dir())
+    assert len(folders) == len(groups)
+    occupancy = read_map(tmp_path / "map" / "map.yaml")
+    np.testing.assert_array_equal(occupancy.values > 50, source.showing().map_of(0).values > 50)
+    # A pixel of the picture, by the world file, lies where the map has the cell.
+    step_x, turn, _, step_y, x, y = map(float, (tmp_path / "map" / "map.pgw").read_text().split())
+    place = [[x + 3 * step_x, y + 5 * step_y]]
+    assert turn == 0.0
+    assert occupancy.spec.cells_of(place).tolist() == [[occupancy.spec.num_rows - 6, 3]]
+    tracks = json.loads((tmp_path / "map" / "tracks.geojson").read_text())["features"]
+    assert [track["properties"]["vehicle"] for track in tracks] == groups[0]["vehicles"]
+    for track in tracks:
+        _, poses = read_tum(tmp_path / "map" / f"{track['properties']['vehicle']}.tum")
+        np.testing.assert_allclose(poses[:, :2], track["geometry"]["coordinates"], atol=1e-3)
+    vertices, edges = read_g2o(tmp_path / "map" / "graph.g2o")
+    assert len(vertices) == groups[0]["num_submaps"]
+    assert len(edges) == len(groups[0]["vehicles"]) - 1
 
 
 @pytest.mark.parametrize(

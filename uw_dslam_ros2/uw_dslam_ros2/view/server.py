@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from aiohttp import web
 
 from uw_dslam_ros2.core.errors import InvalidInputError, UwDslamError
+from uw_dslam_ros2.view.export import export_zip
 from uw_dslam_ros2.view.pairs import PAIR_LAYERS, Pair
 from uw_dslam_ros2.view.showing import Register, Showing
 from uw_dslam_ros2.view.tiles import tile_png
@@ -106,6 +107,7 @@ class ViewServer:
                 web.get("/api/status", self._status),
                 web.get("/api/events", self._events),
                 web.get("/api/cell", self._cell),
+                web.get("/api/export.zip", self._export),
                 web.get("/api/tiles/{version}/{moment}/{zoom}/{col}/{row}.png", self._tile),
                 web.get("/api/pairs/{number}", self._pair),
                 web.get("/api/pairs/{number}/rivals", self._rivals),
@@ -224,6 +226,14 @@ class ViewServer:
         x_m, y_m = float(request.query["x"]), float(request.query["y"])
         found = await self._in_thread(lambda: self._source.showing().cell(x_m, y_m))
         return web.json_response(found)
+
+    async def _export(self, _request: web.Request) -> web.StreamResponse:
+        body = await self._in_thread(lambda: export_zip(self._source.showing()))
+        return web.Response(
+            body=body,
+            content_type="application/zip",
+            headers={"Content-Disposition": 'attachment; filename="map.zip"'},
+        )
 
     async def _tile(self, request: web.Request) -> web.StreamResponse:
         info = request.match_info

@@ -66,20 +66,21 @@ class Showing:
         answers: Sequence[tuple[Answer, bool]] = (),
         before: Showing | None = None,
     ) -> None:
-        self._records = list(records)
-        self._constraints, self._answers = list(constraints), list(answers)
+        self.records = list(records)
+        self.constraints = list(constraints)
+        self._answers = list(answers)
         self._stored: dict[SubmapId, StoredSubmap] = dict(before._stored) if before else {}
         self._outlines: dict[SubmapId, FloatArray] = dict(before._outlines) if before else {}
         self._drawn: dict[int, GlobalMap] = before._drawn if before else {}
         self._layers: OrderedDict[int, list[Layer]] = OrderedDict()
-        for record in self._records:
+        for record in self.records:
             submap, key = record.submap, record.submap.submap_id
             held = self._stored.get(key)
             if held is None or held.submap is not submap:
                 self._stored[key] = StoredSubmap.of(submap, submap.grid.values.size)
                 self._outlines[key] = outline_of(submap.grid)
         self._by_time = sorted(
-            (r for r in self._records if r.state is not SubmapState.WITHDRAWN),
+            (r for r in self.records if r.state is not SubmapState.WITHDRAWN),
             key=lambda r: (r.submap.stamp_ns, r.submap.submap_id),
         )
         self._T_view_group = self._side_by_side()
@@ -102,10 +103,10 @@ class Showing:
                 r.component,
                 self._T_view_group[r.component] @ r.T_component_submap,
             )
-            for r in self._records
+            for r in self.records
             if r.state is not SubmapState.WITHDRAWN
         }
-        constraints = (constraint_row(c, places) for c in self._constraints)
+        constraints = (constraint_row(c, places) for c in self.constraints)
         return {
             "version": self.version,
             "moments": [
@@ -113,10 +114,10 @@ class Showing:
                 for r in self._by_time
             ],
             "groups": self._group_rows(),
-            "vehicles": vehicle_rows(self._records, self._T_view_group),
+            "vehicles": vehicle_rows(self.records, self._T_view_group),
             "submaps": [
                 submap_row(r, self._outlines[r.submap.submap_id], self._T_view_group[r.component])
-                for r in self._records
+                for r in self.records
             ],
             "constraints": [row for row in constraints if row is not None],
             "registrations": [
@@ -138,12 +139,16 @@ class Showing:
         self._layers.move_to_end(count)
         return self._layers[count]
 
+    def map_of(self, group: int) -> OccupancyMap | None:
+        """One group's map in its own frame; None where nothing was seen."""
+        return dict(self._maps(self.num_moments)).get(group)
+
     def cell(self, x_m: float, y_m: float) -> dict[str, Any] | None:
         """What is known of the cell under a place of the page; None where nothing is."""
         for group, T_view_group in self._T_view_group.items():
             place = T_view_group.inverse().apply(np.array([[x_m, y_m]]))
             seen_by = {}
-            for record in self._records:
+            for record in self.records:
                 if record.component != group or record.state is SubmapState.WITHDRAWN:
                     continue
                 value = _value_at(record, place)
@@ -244,7 +249,7 @@ class Showing:
             else:
                 placed[group] = SE2(edge_m + gap - low_x, top_m - high_y)
                 edge_m += gap + high_x - low_x
-        for record in self._records:  # withdrawn ones may be alone in theirs
+        for record in self.records:  # withdrawn ones may be alone in theirs
             placed.setdefault(record.component, SE2())
         return placed
 
@@ -284,11 +289,11 @@ class Showing:
 
     def _fingerprint(self) -> str:
         hasher = hashlib.blake2b(digest_size=8)
-        for record in self._records:
+        for record in self.records:
             key = record.submap.submap_id
             row = (str(key), record.state, record.component, record.T_component_submap)
             hasher.update(repr(row).encode() + self._stored[key].digest)
-        for constraint in self._constraints:
+        for constraint in self.constraints:
             hasher.update(
                 repr((constraint.source, constraint.target, constraint.is_inlier)).encode()
             )

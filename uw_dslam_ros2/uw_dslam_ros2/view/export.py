@@ -1,0 +1,136 @@
+"""What is shown, as files for other programs, in one archive."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+import zipfile
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
+from uw_dslam_ros2.core.submap import track_name
+from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.trajectories import PoseGraphEdge, g2o_bytes, tum_bytes
+from uw_dslam_ros2.view.showing import Showing
+
+__all__ = ["export_zip"]
+
+_FIRST_TIME = (1980, 1, 1, 0, 0, 0)  # the same state gives the same bytes
+_README = """\
+Each folder holds one group of vehicles that share a frame; lengths are metres.
+map.yaml, map.pgm   as nav2's map_server reads them
+map.png, map.pgw    a picture and its world file, for GIS programs
+tracks.geojson      the vehicles' tracks; coordinates are metres of the group's frame
+*.tum               the tracks with times: seconds x y z qx qy qz qw
+graph.g2o           the pose graph, without edges that were found wrong
+"""
+
+
+def export_zip(showing: Showing) -> bytes:
+    """An archive (zip) of maps, tracks and pose graphs of all groups."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+
+        def add(name: str, content: bytes) -> None:
+            archive.writestr(zipfile.ZipInfo(name, _FIRST_TIME), content, zipfile.ZIP_DEFLATED)
+
+        add("README.txt", _README.encode())
+        for group, records in sorted(_by_group(showing).items()):
+            folder = "map" if group == 0 else f"group_{group}"
+            for name, content in _files(showing, group, records).items():
+                add(f"{folder}/{name}", content)
+    return buffer.getvalue()
+
+
+def _by_group(showing: Showing) -> dict[int, list[SubmapRecord]]:
+    groups: dict[int, list[SubmapRecord]] = defaultdict(list)
+    for record in showing.records:
+        if record.state is not SubmapState.WITHDRAWN:
+            groups[record.component].append(record)
+    return groups
+
+
+def _files(showing: Showing, group: int, records: list[SubmapRecord]) -> dict[str, bytes]:
+    files: dict[str, bytes] = {}
+    occupancy = showing.map_of(group)
+    if occupancy is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            for path in write_map(Path(folder) / "map", occupancy):
+                files[path.name] = path.read_bytes()
+        spec = occupancy.spec
+        files["map.pgw"] = _world_file(spec.resolution_m, spec.T_frame_grid.yaw, *_top_left(spec))
+    tracks = _tracks(records)
+    for name, (stamps_ns, poses) in tracks.items():
+        files[f"{_plain(name)}.tum"] = tum_bytes(stamps_ns, poses)
+    files["tracks.geojson"] = _geojson(tracks)
+    keys = {record.submap.submap_id: index for index, record in enumerate(records)}
+    vertices = {keys[r.submap.submap_id]: r.T_component_submap for r in records}
+    edges = [
+        PoseGraphEdge(
+            keys[c.target],
+            keys[c.source],
+            c.T_target_source,
+            # Odometry may claim to be perfect; the file needs an inverse.
+            c.covariance + np.diag([1e-6, 1e-6, 1e-8]),
+        )
+        for c in showing.constraints
+        if c.is_inlier and c.source in keys and c.target in keys
+    ]
+    files["graph.g2o"] = g2o_bytes(vertices, edges)
+    return files
+
+
+def _tracks(records: list[SubmapRecord]) -> dict[str, tuple[Any, Any]]:
+    pieces: dict[str, list[tuple[Any, Any]]] = defaultdict(list)
+    for record in records:
+        submap = record.submap
+        if len(submap.trajectory):
+            motion = record.T_component_submap
+            poses = np.column_stack(
+                [
+                    motion.apply(submap.trajectory[:, :2]),
+                    submap.trajectory[:, 2] + motion.yaw,
+                ]
+            )
+            name = track_name(submap.submap_id.track)
+            pieces[name].append((submap.trajectory_stamp_ns, poses))
+    tracks = {}
+    for name, parts in sorted(pieces.items()):
+        stamps_ns = np.concatenate([part[0] for part in parts])
+        order = np.argsort(stamps_ns, kind="stable")
+        tracks[name] = stamps_ns[order], np.concatenate([part[1] for part in parts])[order]
+    return tracks
+
+
+def _geojson(tracks: dict[str, tuple[Any, Any]]) -> bytes:
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"vehicle": name},
+            "geometry": {"type": "LineString", "coordinates": poses[:, :2].round(3).tolist()},
+        }
+        for name, (_, poses) in tracks.items()
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features}).encode()
+
+
+def _top_left(spec: Any) -> tuple[float, float]:
+    """Middle of the picture's first cell, which is that of the last row."""
+    x, y = spec.centers_of(np.array([[spec.num_rows - 1, 0]]))[0]
+    return float(x), float(y)
+
+
+def _world_file(resolution_m: float, yaw_rad: float, x_m: float, y_m: float) -> bytes:
+    """Six numbers: what a step right and a step down are, and where the first pixel lies."""
+    c, s = resolution_m * np.cos(yaw_rad), resolution_m * np.sin(yaw_rad)
+    return "".join(f"{value:.9f}\n" for value in (c, s, s, -c, x_m, y_m)).encode()
+
+
+def _plain(name: str) -> str:
+    """A name that stays in its folder on every system."""
+    return "".join(c if c.isalnum() or c in "-_#" else "_" for c in name)[:80] or "_"
