@@ -46,12 +46,18 @@ def log_odds_at(grid, x, y):
     return part.log_odds[row, col] / UNITS_PER_NAT if part.observed[row, col] else None
 
 
+def wall_ping(x, bearings, rng=None, sigma=0.0, **kwargs):
+    """A flat wall across the x axis."""
+    noise = 0.0 if rng is None else rng.normal(0.0, sigma, len(bearings))
+    return ping(x / np.cos(bearings) + noise, bearings, **kwargs)
+
+
 def test_target_to_port_is_mapped_to_port():
     grid = GrowingGrid(CONFIG)
     # The vehicle looks north; 5 m away, 30 degrees to port, is north-west.
     grid.add(ping([5.0], [math.pi / 6]), SE2(10.0, 20.0, math.pi / 2))
     x, y = 10.0 - 2.5, 20.0 + 4.330127
-    assert log_odds_at(grid, x, y) == pytest.approx(CONFIG.hit_log_odds, abs=0.001)
+    assert 0.2 * CONFIG.hit_log_odds < log_odds_at(grid, x, y) < CONFIG.hit_log_odds
     assert log_odds_at(grid, 10.0 - 1.25, 20.0 + 2.165) == pytest.approx(-CONFIG.free_log_odds)
     assert log_odds_at(grid, 10.0 + 2.5, y) is None
     beyond = 6.0 / 5.0
@@ -169,12 +175,63 @@ def test_packing_loses_nothing(rng):
 def test_percent_is_the_logistic_function():
     grid = GrowingGrid(CONFIG)
     for _ in range(3):
-        grid.add(ping([3.05], [0.0]), SE2())
-    found = grid.trimmed().to_occupancy(4.0)
-    cell = found.spec.cells_of([[3.05, 0.001]])[0]
-    p = 1.0 / (1.0 + math.exp(-3 * CONFIG.hit_log_odds))
-    assert found.values[tuple(cell)] == round(100 * p)
+        grid.add(wall_ping(3.05, np.linspace(-0.4, 0.4, 81), beamwidth=0.02), SE2())
+    part = grid.trimmed()
+    found = part.to_occupancy(4.0)
+    cell = tuple(found.spec.cells_of([[3.05, 0.05]])[0])
+    # All along a wall each ping counts as one echo there.
+    assert part.log_odds[cell] == pytest.approx(3 * CONFIG.hit_log_odds * UNITS_PER_NAT, rel=0.1)
+    p = 1.0 / (1.0 + math.exp(-part.log_odds[cell] / UNITS_PER_NAT))
+    assert found.values[cell] == round(100 * p)
     assert (found.values == -1).any()
+
+
+def test_a_face_lies_where_noisy_echoes_heap_up(rng):
+    """Thinner than they scatter, in the right place; before it water, behind it nothing."""
+    config = OccupancyConfig(resolution_m=0.05, free_range_max_m=20.0)
+    grid = GrowingGrid(config)
+    bearings = np.linspace(-0.6, 0.6, 121)
+    for y in np.linspace(-1.0, 1.0, 21):
+        seen = wall_ping(6.0, bearings, rng, sigma=0.06, beamwidth=0.01)
+        grid.add(seen, SE2(0.0, float(y), 0.0))
+    part = grid.trimmed()
+    rows = slice(*(int(y / 0.05) - part.row for y in (-2.0, 2.0)))
+    columns = np.arange(part.log_odds.shape[1]) + part.col
+    wall = part.observed[rows] & (part.log_odds[rows] > 0)
+    assert wall.any(axis=1).all()
+    assert wall.sum(axis=1).mean() < 3.0
+    middle = (wall * (columns + 0.5)).sum(axis=1) / wall.sum(axis=1) * 0.05
+    assert np.abs(middle - 6.0).mean() < 0.03
+    assert (part.log_odds[rows, columns * 0.05 < 5.6] <= 0).all()
+    assert not part.observed[rows, columns * 0.05 > 6.3].any()
+
+
+def test_arcs_of_wide_beams_become_the_wall_that_they_touch(rng):
+    config = OccupancyConfig(resolution_m=0.1, free_range_max_m=20.0)
+    grid = GrowingGrid(config)
+    for y in np.arange(-3.0, 3.01, 0.1):
+        # The nearest point of the wall answers a beam of seven degrees, wherever it points.
+        bearing = rng.uniform(-0.06, 0.06)
+        grid.add(ping([6.03], [bearing], beamwidth=0.12), SE2(0.0, float(y), 0.0))
+    part = grid.trimmed()
+    rows = slice(*(int(y / 0.1) - part.row for y in (-2.0, 2.0)))
+    columns = np.arange(part.log_odds.shape[1]) + part.col
+    wall = part.observed[rows] & (part.log_odds[rows] > 0)
+    assert wall.any(axis=1).mean() > 0.95
+    where = np.broadcast_to((columns + 0.5) * 0.1, wall.shape)[wall]
+    assert np.abs(where - 6.03).mean() < 0.1
+    assert (np.abs(where - 6.03) > 0.2).mean() < 0.05
+
+
+def test_a_weak_tail_behind_a_face_is_no_wall():
+    config = OccupancyConfig(resolution_m=0.05, free_range_max_m=20.0)
+    bearings = np.linspace(-0.4, 0.4, 81)
+    grid = GrowingGrid(config)
+    for number in range(10):
+        x = 6.2 if number % 5 == 0 else 6.0
+        grid.add(wall_ping(x, bearings, beamwidth=0.01), SE2())
+    assert log_odds_at(grid, 6.02, 0.02) > 3.0
+    assert log_odds_at(grid, 6.22, 0.02) is None
 
 
 def test_a_compressed_grid_is_drawn_as_the_grid_itself(rng):

@@ -35,7 +35,9 @@ class OccupancyConfig(Config):
     resolution_m: float = setting(
         0.05, 0.01, 10.0, "cell size of the map [m]; coarser where the sonar is", is_basic=True
     )
-    hit_log_odds: float = setting(0.7, 0.01, 10.0, "log-odds of a strong echo at its own cell")
+    hit_log_odds: float = setting(
+        0.7, 0.01, 10.0, "log-odds that a strong echo adds to a wall's face"
+    )
     free_log_odds: float = setting(
         0.15, 0.001, 10.0, "log-odds of free water before the first echo, taken off"
     )

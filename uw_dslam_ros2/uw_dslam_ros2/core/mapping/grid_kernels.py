@@ -1,6 +1,6 @@
 """Compiled loops of occupancy mapping.
 
-Log-odds are integers, so that sums do not depend on order.
+Evidence is summed in integers, so that sums do not depend on order.
 """
 
 from __future__ import annotations
@@ -8,11 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["NUM_DIRECTIONS", "add_ping", "beam_table", "diamond"]
+__all__ = ["NUM_DIRECTIONS", "add_ping", "beam_table", "diamond", "draw_faces"]
 
 NUM_DIRECTIONS = 16384
 _SLOTS_PER_BIN = 16
 _LONG_RUN, _SHORT_RUN = 32, 8
+_REACH = 2.5  # standard deviations, beyond which an echo says nothing
 
 
 @njit(cache=True, nogil=True)
@@ -132,14 +133,13 @@ def _water_window(limit, sonar_x, sonar_y, cos, sin):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True)
 def _add_water(  # type: ignore[no-untyped-def]
-    log_odds, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
-    limit, free,
+    water, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin, limit,
 ):  # fmt: skip
-    """Take `free` from every cell nearer than its direction's `limit` (a squared range).
+    """Count one in every cell nearer than its direction's `limit` (a squared range).
 
     Runs of cells are decided by their ends where possible; the others cell by cell.
     """
-    num_rows, num_cols = log_odds.shape
+    num_rows, num_cols = water.shape
     num_directions = limit.shape[0]
     reach, low_x, high_x, low_y, high_y = _water_window(limit, sonar_x, sonar_y, cos, sin)
     if reach <= 0.0:
@@ -169,19 +169,16 @@ def _add_water(  # type: ignore[no-untyped-def]
                 size = _SHORT_RUN
                 continue
             if state == 1:
-                # Views counted from zero: the compiler then writes many cells at a time.
-                water, seen = log_odds[row, start : stop + 1], observed[row, start : stop + 1]
-                for i in range(water.shape[0]):
-                    water[i] -= free
-                for i in range(seen.shape[0]):
-                    seen[i] = True
+                # A view counted from zero: the compiler then writes many cells at a time.
+                run = water[row, start : stop + 1]
+                for i in range(run.shape[0]):
+                    run[i] += 1
             elif state == 0:
                 for col in range(start, stop + 1):
                     dx = (origin_col + col + 0.5) * resolution - sonar_x
                     slot = _slot(cos * dx + sin * dy, -sin * dx + cos * dy, num_directions)
                     if dx * dx + dy * dy < limit[slot]:
-                        log_odds[row, col] -= free
-                        observed[row, col] = True
+                        water[row, col] += 1
             start = stop + 1
             if (start - c0) % _LONG_RUN == 0:
                 size = _LONG_RUN
@@ -189,78 +186,188 @@ def _add_water(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def add_ping(  # type: ignore[no-untyped-def]
-    log_odds, observed, echo, origin_row, origin_col, resolution,
+    echoes, water, scratch, origin_row, origin_col, resolution,
     sonar_x, sonar_y, sonar_yaw,
-    points, weight, sigma_range, beamwidth, max_spread,
-    table, free_range, hit, free,
+    points, weight, sigma_range, beamwidth, max_spread, least_sigma,
+    table, free_range, hit,
 ):  # fmt: skip
-    """Add one ping's log-odds: at most one contribution to each cell, echo before water.
+    """Add one ping's evidence: at most one contribution to each cell, echo before water.
 
-    Points (N, 2) are in the sonar's frame; cell (0, 0) has its outer corner at `origin` cells from
-    the frame's zero. Cells outside the grid are left out. `echo` (R, C) int16 is scratch: zeros
-    in, zeros out; making it anew for each ping would cost more than the ping.
+    `echoes` (R, C) sums what echoes say, `hit` where a strong one lies; `water` (R, C) counts the
+    pings that looked through. Points (N, 2) are in the sonar's frame; cell (0, 0) has its outer
+    corner at `origin` cells from the frame's zero. Cells outside the grid are left out.
+    `least_sigma` [m] is the least spread of an echo. `scratch` (R, C) int16 is zeros in, zeros
+    out; making it anew for each ping would cost more than the ping.
     """
-    num_rows, num_cols = log_odds.shape
+    num_rows, num_cols = echoes.shape
     cos, sin = np.cos(sonar_yaw), np.sin(sonar_yaw)
     limit = np.full(table.shape[0], -1.0)
     for k in range(table.shape[0]):
         if table[k] >= 0:
             limit[k] = free_range[table[k]] * free_range[table[k]]
-    _add_water(
-        log_odds, observed, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin,
-        limit, free,
-    )  # fmt: skip
-    count = points.shape[0]
-    axes = np.empty((count, 6))  # of each echo: place, direction, spread along and across
-    for i in range(count):
-        rng = np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
-        ux, uy = (points[i, 0] / rng, points[i, 1] / rng) if rng > 0.0 else (1.0, 0.0)
-        axes[i, 0] = sonar_x + cos * points[i, 0] - sin * points[i, 1]
-        axes[i, 1] = sonar_y + sin * points[i, 0] + cos * points[i, 1]
-        axes[i, 2], axes[i, 3] = cos * ux - sin * uy, sin * ux + cos * uy
-        # The echo lies on an arc: sharp in range, as wide as the beam across. At least half a
-        # cell, so that it shows.
-        axes[i, 4] = max(sigma_range, 0.5 * resolution)
-        axes[i, 5] = max(min(0.5 * beamwidth * rng, max_spread), 0.5 * resolution)
+    _add_water(water, origin_row, origin_col, resolution, sonar_x, sonar_y, cos, sin, limit)
     touched_rows, touched_cols = np.empty(1024, np.int64), np.empty(1024, np.int64)
     num_touched = 0
-    for i in range(count):
-        px, py, ax, ay = axes[i, 0], axes[i, 1], axes[i, 2], axes[i, 3]
-        span = 2.0 * max(axes[i, 4], axes[i, 5])
-        c0 = max(0, int(np.floor((px - span) / resolution)) - origin_col)
-        c1 = min(num_cols - 1, int(np.floor((px + span) / resolution)) - origin_col)
-        r0 = max(0, int(np.floor((py - span) / resolution)) - origin_row)
-        r1 = min(num_rows - 1, int(np.floor((py + span) / resolution)) - origin_row)
-        own_row = int(np.floor(py / resolution)) - origin_row
-        own_col = int(np.floor(px / resolution)) - origin_col
+    for i in range(points.shape[0]):
+        rng = np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
+        ux, uy = (points[i, 0] / rng, points[i, 1] / rng) if rng > 0.0 else (1.0, 0.0)
+        px = sonar_x + cos * points[i, 0] - sin * points[i, 1]
+        py = sonar_y + sin * points[i, 0] + cos * points[i, 1]
+        ax, ay = cos * ux - sin * uy, sin * ux + cos * uy
+        # The echo lies on an arc: sharp in range, as wide as the beam across.
+        sigma_along = max(sigma_range, least_sigma)
+        sigma_across = max(min(0.5 * beamwidth * rng, max_spread), least_sigma)
+        reach_x = _REACH * np.sqrt((ax * sigma_along) ** 2 + (ay * sigma_across) ** 2)
+        reach_y = _REACH * np.sqrt((ay * sigma_along) ** 2 + (ax * sigma_across) ** 2)
+        c0 = max(0, int(np.floor((px - reach_x) / resolution)) - origin_col)
+        c1 = min(num_cols - 1, int(np.floor((px + reach_x) / resolution)) - origin_col)
+        r0 = max(0, int(np.floor((py - reach_y) / resolution)) - origin_row)
+        r1 = min(num_rows - 1, int(np.floor((py + reach_y) / resolution)) - origin_row)
         for row in range(r0, r1 + 1):
             dy = (origin_row + row + 0.5) * resolution - py
             for col in range(c0, c1 + 1):
                 dx = (origin_col + col + 0.5) * resolution - px
                 along, across = ax * dx + ay * dy, -ay * dx + ax * dy
-                size = (along / axes[i, 4]) ** 2 + (across / axes[i, 5]) ** 2
-                if row == own_row and col == own_col:
-                    size = 0.0
-                if size >= 4.0:
+                size = (along / sigma_along) ** 2 + (across / sigma_across) ** 2
+                if size >= _REACH * _REACH:
                     continue
                 value = np.int32(np.rint(hit * weight[i] * np.exp(-0.5 * size)))
-                before = np.int32(echo[row, col])
+                before = np.int32(scratch[row, col])
                 if value <= before:
                     continue
                 if before == 0:
-                    # An echo here: what the water has taken is given back.
+                    # An echo here: this ping's water is taken back.
                     wx = (origin_col + col + 0.5) * resolution - sonar_x
                     wy = (origin_row + row + 0.5) * resolution - sonar_y
                     slot = _slot(cos * wx + sin * wy, -sin * wx + cos * wy, limit.shape[0])
                     if wx * wx + wy * wy < limit[slot]:
-                        log_odds[row, col] += free
-                    observed[row, col] = True
+                        water[row, col] -= 1
                     if num_touched == touched_rows.shape[0]:
                         touched_rows = np.concatenate((touched_rows, np.empty_like(touched_rows)))
                         touched_cols = np.concatenate((touched_cols, np.empty_like(touched_cols)))
                     touched_rows[num_touched], touched_cols[num_touched] = row, col
                     num_touched += 1
-                log_odds[row, col] += value - before
-                echo[row, col] = value
+                echoes[row, col] += value - before
+                scratch[row, col] = value
     for k in range(num_touched):
-        echo[touched_rows[k], touched_cols[k]] = 0
+        scratch[touched_rows[k], touched_cols[k]] = 0
+
+
+@njit(cache=True, nogil=True)
+def _smoothed(values, taps):  # type: ignore[no-untyped-def]
+    """Weighted means (R, C) int32 of whole numbers, none negative, by a separable kernel.
+
+    The taps, of odd number, sum to 256.
+    """
+    num_rows, num_cols = values.shape
+    reach = taps.shape[0] // 2
+    across = np.zeros((num_rows, num_cols), np.int32)
+    smooth = np.zeros((num_rows, num_cols), np.int32)
+    has_any = np.zeros(num_rows, np.bool_)
+    line = np.zeros(num_cols, np.int64)
+    for row in range(num_rows):
+        # Echoes are few: they are spread, not gathered.
+        for col in range(num_cols):
+            value = np.int64(values[row, col])
+            if value > 0:
+                has_any[row] = True
+                for c in range(max(0, col - reach), min(num_cols, col + reach + 1)):
+                    line[c] += taps[c - col + reach] * value
+        if has_any[row]:
+            for col in range(num_cols):
+                across[row, col] = (line[col] + 128) >> 8
+            line[:] = 0
+    for row in range(num_rows):
+        first, last = max(0, row - reach), min(num_rows - 1, row + reach)
+        if not has_any[first : last + 1].any():
+            continue
+        line[:] = 0
+        for r in range(first, last + 1):
+            if has_any[r]:
+                tap = taps[r - row + reach]
+                for col in range(num_cols):
+                    line[col] += tap * across[r, col]
+        for col in range(num_cols):
+            smooth[row, col] = (line[col] + 128) >> 8
+    return smooth
+
+
+@njit(cache=True, nogil=True)
+def _crest_distance(heap, row, col):  # type: ignore[no-untyped-def]
+    """How far [cells] a cell's centre lies from the crest of a heap; infinite: there is none.
+
+    A quadratic is fitted to the 3 x 3 cells (Haralick's facet model); the crest runs where it is
+    highest across its sharpest bend (Steger 1998, IEEE PAMI 20(2)).
+    """
+    num_rows, num_cols = heap.shape
+    z = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            r, c = row + i - 1, col + j - 1
+            if 0 <= r < num_rows and 0 <= c < num_cols:
+                z[i, j] = heap[r, c]
+    left, right = z[0, 0] + z[1, 0] + z[2, 0], z[0, 2] + z[1, 2] + z[2, 2]
+    low, high = z[0, 0] + z[0, 1] + z[0, 2], z[2, 0] + z[2, 1] + z[2, 2]
+    total = left + right + z[0, 1] + z[1, 1] + z[2, 1]
+    slope_x, slope_y = (right - left) / 6.0, (high - low) / 6.0
+    bend_xx = (3.0 * (left + right) - 2.0 * total) / 3.0
+    bend_yy = (3.0 * (low + high) - 2.0 * total) / 3.0
+    bend_xy = (z[2, 2] + z[0, 0] - z[0, 2] - z[2, 0]) / 4.0
+    half = 0.5 * (bend_xx - bend_yy)
+    mean = 0.5 * (bend_xx + bend_yy)
+    if mean >= 0.0:  # on a flank, which only along the wall has tops
+        return np.inf
+    least = mean - np.sqrt(half * half + bend_xy * bend_xy)
+    # The eigenvector of the least eigenvalue, from the row that is farther from zero.
+    if abs(bend_xx - least) > abs(bend_yy - least):
+        nx, ny = -bend_xy, bend_xx - least
+    else:
+        nx, ny = bend_yy - least, -bend_xy
+    size = np.sqrt(nx * nx + ny * ny)
+    if size == 0.0:  # a round top bends alike every way
+        return np.sqrt(slope_x * slope_x + slope_y * slope_y) / -least
+    return abs(slope_x * nx + slope_y * ny) / size / -least
+
+
+@njit(cache=True, nogil=True)
+def _is_tail(heap, row, col, reach, share):  # type: ignore[no-untyped-def]
+    """Whether something `reach` cells around is so much higher that `share` of it is more."""
+    num_rows, num_cols = heap.shape
+    limit = heap[row, col] / share
+    for r in range(max(0, row - reach), min(num_rows, row + reach + 1)):
+        for c in range(max(0, col - reach), min(num_cols, col + reach + 1)):
+            if heap[r, c] > limit:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def draw_faces(  # type: ignore[no-untyped-def]
+    echoes, water, taps, gain, free, half_width, reach, least_share
+):  # fmt: skip
+    """Log-odds (R, C) and what was observed, of summed evidence (see `add_ping`).
+
+    Where pings heard a wall their echoes heap up: smoothed by `taps` and scaled by `gain`, the
+    face runs along the crest of the heap, `half_width` cells to each side. What is lower than
+    `least_share` of something within `reach` cells is that one's tail. What lies before a face is
+    as free as it was seen to be, unless more echoes came from there; what lies behind it nobody
+    has seen.
+    """
+    num_rows, num_cols = echoes.shape
+    log_odds = np.zeros((num_rows, num_cols), np.int32)
+    observed = np.zeros((num_rows, num_cols), np.bool_)
+    heap = _smoothed(echoes, taps)
+    for row in range(num_rows):
+        for col in range(num_cols):
+            passed = np.int32(free * water[row, col])
+            said = np.int32(np.rint(gain * heap[row, col]))
+            is_face = said > 0 and _crest_distance(heap, row, col) <= half_width
+            if is_face and not _is_tail(heap, row, col, reach, least_share):
+                log_odds[row, col] = said - passed
+                observed[row, col] = True
+                continue
+            # Beside a face more echoes than water: neither a wall nor free.
+            if passed > said:
+                log_odds[row, col] = -passed
+                observed[row, col] = True
+    return log_odds, observed
