@@ -5,15 +5,16 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import multiprocessing
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any
 
 from uw_dslam_ros2.cli.common import num_processors, num_workers
+from uw_dslam_ros2.core.chart.pings import DrawnPing, KeptPings
 from uw_dslam_ros2.core.clocks import find_gaps
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
@@ -98,6 +99,7 @@ class VehicleSubmaps:
     submaps: tuple[Submap, ...]
     diagnostics: dict[str, float | int | str]
     findings: tuple[Finding, ...] = ()
+    pings: Mapping[SubmapId, Sequence[DrawnPing]] = field(default_factory=dict)
 
 
 def map_recordings(
@@ -167,7 +169,7 @@ def map_recording(
         present = {role: SensorCount(1) for role in recording.topics}
         found = health_findings(MappedVehicle(recording.vehicle_id, present, {}))
         return VehicleSubmaps(recording.vehicle_id, (), {}, tuple(found))
-    run_ids = itertools.count(1)
+    run_ids, kept = itertools.count(1), KeptPings()
     newest: dict[SubmapId, Submap] = {}
     number = 0
     has_yaw = has_yaw_rate = False
@@ -179,7 +181,7 @@ def map_recording(
         reader.conventions, sonar, said = mended(examined, sensors.conventions, config.sonar)
         findings += said
         config = dataclasses.replace(config, sonar=sonar)
-        runs = VehicleRuns(config, recording.vehicle_id, lambda: next(run_ids))
+        runs = VehicleRuns(config, recording.vehicle_id, lambda: next(run_ids), kept)
         for number, event in enumerate(in_stamp_order(reader.events()), start=1):
             if number % 200 == 0:
                 _count(200)
@@ -235,6 +237,7 @@ def map_recording(
             *mountings.findings(recording.vehicle_id),
             *health_findings(vehicle),
         ),
+        kept.of_submap,
     )
 
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from uw_dslam_ros2.cli.charting import charted
 from uw_dslam_ros2.cli.common import parser_for, progress_bar, run_command, versions
 from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recordings, sensor_config, settle
 from uw_dslam_ros2.cli.outcome import outcome_of
@@ -131,6 +132,8 @@ def _run(args: argparse.Namespace) -> int:
     for note in facts.notes:
         print(f"warning: {note}", file=sys.stderr, flush=True)
     outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
+    pings = {key: own for made in mapped for key, own in made.pings.items()}
+    outcome = charted(outcome, pings, config.mapper[mapped[0].vehicle_id].occupancy)
     save_session(args.out / SESSION_FOLDER, queue)  # for view, and to go on from
     scores = write_report(args.out, outcome, facts, truth, has_pictures=not args.no_report)
     done_s = time.monotonic()

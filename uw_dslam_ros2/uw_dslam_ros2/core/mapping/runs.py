@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.vehicle_mapper import VehicleMapper
+from uw_dslam_ros2.core.mapping.vehicle_mapper import MapperWatch, VehicleMapper
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
 
@@ -65,12 +65,19 @@ class VehicleRuns:
         Whose.
     next_run_id
         Gives each run its number, see `core.submap.Track`.
+    watch
+        As of a `VehicleMapper`.
     """
 
     def __init__(
-        self, config: VehicleMapperConfig, vehicle_id: str, next_run_id: Callable[[], int]
+        self,
+        config: VehicleMapperConfig,
+        vehicle_id: str,
+        next_run_id: Callable[[], int],
+        watch: MapperWatch | None = None,
     ) -> None:
         self._config, self._vehicle_id, self._next_run_id = config, vehicle_id, next_run_id
+        self._watch = watch
         self.mapper = self._new_mapper()
         self.breaks: list[RunBreak] = []
         self.num_pings_blind = 0
@@ -152,7 +159,7 @@ class VehicleRuns:
         return np.concatenate(stamps), np.vstack(poses)
 
     def _new_mapper(self) -> VehicleMapper:
-        return VehicleMapper(self._config, self._vehicle_id, self._next_run_id())
+        return VehicleMapper(self._config, self._vehicle_id, self._next_run_id(), self._watch)
 
     def _note(self, role: str, stamp_ns: int) -> list[Submap]:
         held = self._heard.get(role)

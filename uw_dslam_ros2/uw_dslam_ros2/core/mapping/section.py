@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,8 @@ from uw_dslam_ros2.core.submap import Submap
 __all__ = ["ClosedSection", "OpenSection"]
 
 FloatArray = NDArray[np.float64]
+Watch = Callable[[Detections, SE2], None]
+"""Called with all that enters a grid, and its ``T_submap_sonar``."""
 
 _MIN_MOTION_M, _MIN_TURN_RAD, _MIN_INTERVAL_S = 0.1, 0.02, 1.0
 """A ping enters the grid after this path length, turn or time, whichever comes first: pings of
@@ -78,7 +81,13 @@ class ClosedSection:
 class OpenSection:
     """Pings of one submap in its own frame, base_link's pose at its start."""
 
-    def __init__(self, config: VehicleMapperConfig, sequence: int, covariance: FloatArray) -> None:
+    def __init__(
+        self,
+        config: VehicleMapperConfig,
+        sequence: int,
+        covariance: FloatArray,
+        watch: Watch | None = None,
+    ) -> None:
         self._config = config
         self.sequence = sequence
         self._covariance = covariance
@@ -90,6 +99,7 @@ class OpenSection:
         self._length_m = 0.0
         self._last_mapped: tuple[int, SE2] | None = None
         self.num_pings = 0
+        self._watch = watch
 
     @property
     def poses(self) -> FloatArray:
@@ -109,7 +119,7 @@ class OpenSection:
         if self._is_due(stamp_ns, T_submap_base):
             self._last_mapped = (stamp_ns, T_submap_base)
             T_submap_sonar = T_submap_base @ T_base_sonar
-            self.grid.add(detections, T_submap_sonar)
+            self._draw(detections, T_submap_sonar)
             self._keep(detections, T_submap_sonar)
 
     def add_sweep(self, sweep: PlacedSweep, T_submap_reference: SE2) -> None:
@@ -118,7 +128,7 @@ class OpenSection:
             self._go_on(int(stamp_ns), T_submap_reference @ SE2.from_array(pose))
         self.num_pings += 1
         for part in sweep.slices:
-            self.grid.add(part.detections, T_submap_reference @ part.T_reference_sonar)
+            self._draw(part.detections, T_submap_reference @ part.T_reference_sonar)
         self._keep(sweep.detections, T_submap_reference)
 
     def _go_on(self, stamp_ns: int, T_submap_base: SE2) -> None:
@@ -127,6 +137,11 @@ class OpenSection:
             self._length_m += math.hypot(T_submap_base.x - x, T_submap_base.y - y)
         self._trajectory.append((T_submap_base.x, T_submap_base.y, T_submap_base.yaw))
         self._stamps_ns.append(stamp_ns)
+
+    def _draw(self, detections: Detections, T_submap_sonar: SE2) -> None:
+        self.grid.add(detections, T_submap_sonar)
+        if self._watch is not None:
+            self._watch(detections, T_submap_sonar)
 
     def _keep(self, detections: Detections, T_submap_sonar: SE2) -> None:
         """Keep the echoes, and the walls between those of wide beams, for matching."""

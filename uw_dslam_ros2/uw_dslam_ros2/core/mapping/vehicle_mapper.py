@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,11 +33,12 @@ from uw_dslam_ros2.core.sonar import (
     place_sweep,
 )
 from uw_dslam_ros2.core.sonar.turning import Sweep, beams_of_image, is_few_beams
-from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
+from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap, SubmapId
 
-__all__ = ["VehicleMapper"]
+__all__ = ["MapperWatch", "VehicleMapper"]
 
 FloatArray = NDArray[np.float64]
+MapperWatch = Callable[[SubmapId, Detections, SE2], None]
 _REISSUE_M, _REISSUE_RAD = 0.02, 0.002
 """A submap that moved by more is given away again."""
 _ATTITUDE_NS = 500_000_000
@@ -57,15 +60,23 @@ class VehicleMapper:
     same is put where it belongs, for the pings that follow; a ping that is late, or earlier than
     all navigation, is left out and counted. The odom frame begins where the vehicle does. A mapper
     is one run (`core.submap.Track`): who begins again makes a new one, with another ``run_id``.
+    ``watch`` is called with all that enters a submap's grid, and its ``T_submap_sonar``.
     """
 
-    def __init__(self, config: VehicleMapperConfig, vehicle_id: str, run_id: int = 1) -> None:
+    def __init__(
+        self,
+        config: VehicleMapperConfig,
+        vehicle_id: str,
+        run_id: int = 1,
+        watch: MapperWatch | None = None,
+    ) -> None:
         if not vehicle_id:
             raise InvalidInputError("vehicle_id is empty, expected a name")
         if not 0 < run_id <= MAX_RUN_ID:
             raise InvalidInputError(f"run_id is {run_id}, expected 1 to {MAX_RUN_ID}")
         self._own_config = config
         self._vehicle_id, self._run_id = vehicle_id, run_id
+        self._watch = watch
         self._navigation = NavigationFilter(config.navigation)
         self._suit(_FAN_BEAM_RAD)
         self._mosaic = Mosaic(GridSpec(config.occupancy.resolution_m, 1, 1))
@@ -415,7 +426,11 @@ class VehicleMapper:
             self._local_map.rebase(T_previous_new.inverse())
             if self._last_key is not None:
                 self._last_key = (self._last_key[0], T_previous_new.inverse() @ self._last_key[1])
-        self._open = OpenSection(self._config, index, covariance)
+        watch = None
+        if self._watch is not None:
+            submap_id = SubmapId(self._vehicle_id, self._run_id, index)
+            watch = functools.partial(self._watch, submap_id)
+        self._open = OpenSection(self._config, index, covariance, watch)
         self._navigation.clone(stamp_ns)
 
     def _is_key(self, stamp_ns: int) -> bool:

@@ -1,0 +1,76 @@
+"""Paths are bent until pings agree on walls, and no further."""
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.chart.refine import Track, refine_tracks
+from uw_dslam_ros2.core.metrics import align_points
+from uw_dslam_ros2.core.se2 import SE2
+
+ROOM_M = (0.0, 0.0, 30.0, 20.0)
+
+
+def echoes_of_room(pose, rng, num=60, sigma=0.03):
+    """Echoes (N, 2) of a fan of 130 degrees in a room with a pillar, in the sonar's frame."""
+    x, y, yaw = pose
+    bearings = np.linspace(-1.13, 1.13, num)
+    cos, sin = np.cos(yaw + bearings), np.sin(yaw + bearings)
+    with np.errstate(divide="ignore"):
+        ways = [(ROOM_M[0] - x) / cos, (ROOM_M[2] - x) / cos]
+        ways += [(ROOM_M[1] - y) / sin, (ROOM_M[3] - y) / sin]
+    ways = np.where(np.array(ways) > 0.0, ways, np.inf)
+    ranges = ways.min(axis=0) + rng.normal(0.0, sigma, num)
+    return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+
+
+def there_and_back(y, num=80):
+    x = np.concatenate([np.linspace(5.0, 25.0, num // 2), np.linspace(25.0, 5.0, num // 2)])
+    yaw = np.concatenate([np.full(num // 2, 0.3), np.full(num // 2, np.pi + 0.3)])
+    return np.column_stack([x, np.full(num, y), yaw])
+
+
+def drifted(poses, rng):
+    """The same path with an error that grows and wanders."""
+    wander = np.cumsum(rng.normal(0.0, [0.012, 0.012, 0.0005], poses.shape), axis=0)
+    return poses + wander
+
+
+def error_m(found, true):
+    found, true = np.vstack(found)[:, :2], np.vstack(true)[:, :2]
+    T = align_points(found, true)
+    return np.sqrt(((T.apply(found) - true) ** 2).sum(axis=1).mean())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_paths_come_nearer_to_the_truth(seed):
+    rng = np.random.default_rng(seed)
+    true = [there_and_back(7.0), there_and_back(13.0)]
+    tracks = [Track(drifted(p, rng), [echoes_of_room(q, rng) for q in p]) for p in true]
+    before = error_m([t.poses for t in tracks], true)
+    after = error_m(refine_tracks(tracks, 0.05, 0.8), true)
+    assert after < 0.7 * before
+
+
+def test_what_agrees_already_stays():
+    rng = np.random.default_rng(5)
+    true = there_and_back(8.0)
+    track = Track(true, [echoes_of_room(q, rng) for q in true])
+    (found,) = refine_tracks([track], 0.05, 0.8)
+    assert np.abs(found[:, :2] - true[:, :2]).max() < 0.05
+
+
+def test_the_same_frame_elsewhere_gives_the_same_walls():
+    rng = np.random.default_rng(7)
+    true = there_and_back(8.0)
+    track = Track(drifted(true, rng), [echoes_of_room(q, rng) for q in true])
+    T = SE2(100.0, -50.0, 0.0)
+    moved = Track(track.poses + T.as_array(), track.echoes)
+    (here,), (there,) = refine_tracks([track], 0.05, 0.8), refine_tracks([moved], 0.05, 0.8)
+    # Blocks lie elsewhere on the walls, so not to the last digit.
+    assert np.abs(there - T.as_array() - here)[:, :2].max() < 0.03
+
+
+def test_pings_without_echoes_stay_where_they_are():
+    poses = there_and_back(8.0)[:10]
+    (found,) = refine_tracks([Track(poses, [np.empty((0, 2))] * 10)], 0.05, 0.8)
+    np.testing.assert_array_equal(found, poses)

@@ -1,0 +1,87 @@
+"""The last pass of ``offline``: the chart, drawn from all pings at the settled graph's poses."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.cli.outcome import Outcome, VehicleOutcome
+from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart, refined
+from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.mapping.config import OccupancyConfig
+from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
+from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
+from uw_dslam_ros2.core.se2 import wrap_angle
+from uw_dslam_ros2.core.submap import SubmapId, Track
+
+__all__ = ["PingTracks", "chart_tracks", "charted"]
+
+FloatArray = NDArray[np.float64]
+Pings = Mapping[SubmapId, Sequence[DrawnPing]]
+PingTracks = dict[Track, PingTrack]
+
+
+def charted(outcome: Outcome, pings: Pings, config: OccupancyConfig) -> Outcome:
+    """The outcome with its global map drawn anew, and the trajectories that belong to that.
+
+    Parameters
+    ----------
+    pings
+        Of every submap.
+    config
+        The sensor model; cells are as large as those of the map that is replaced.
+    """
+    before, after = chart_tracks(outcome, pings)
+    if outcome.global_map is None or not after:
+        return outcome
+    resolution_m = outcome.global_map.spec.resolution_m
+    chart = draw_chart(
+        list(after.values()), dataclasses.replace(config, resolution_m=resolution_m), LOG_ODDS_MAX
+    )
+    vehicles = tuple(_bent(vehicle, before, after) for vehicle in outcome.vehicles)
+    return dataclasses.replace(outcome, global_map=chart, vehicles=vehicles)
+
+
+def chart_tracks(outcome: Outcome, pings: Pings) -> tuple[PingTracks, PingTracks]:
+    """Pings of the merged submaps: at the graph's poses, and at refined ones."""
+    before = _tracks_of(outcome.records, pings)
+    if outcome.global_map is None or not before:
+        return {}, {}
+    after = refined(list(before.values()), outcome.global_map.spec.resolution_m)
+    return before, dict(zip(before, after, strict=True))
+
+
+def _tracks_of(records: Iterable[SubmapRecord], pings: Pings) -> PingTracks:
+    """Pings of each run's merged submaps, where the settled graph places them."""
+    kept: dict[Track, list[DrawnPing]] = {}
+    poses: dict[Track, list[FloatArray]] = {}
+    for record in records:
+        submap_id = record.submap.submap_id
+        if record.state is not SubmapState.MERGED:
+            continue
+        for ping in pings.get(submap_id, ()):
+            pose = record.T_component_submap @ ping.T_submap_sonar
+            kept.setdefault(submap_id.track, []).append(ping)
+            poses.setdefault(submap_id.track, []).append(pose.as_array())
+    return {track: PingTrack(kept[track], np.array(poses[track])) for track in kept}
+
+
+def _bent(vehicle: VehicleOutcome, before: PingTracks, after: PingTracks) -> VehicleOutcome:
+    """Move the trajectory as its pings were moved; between them in proportion."""
+    own = [track for track in before if track.vehicle_id == vehicle.vehicle_id]
+    if vehicle.trajectory is None or not own:
+        return vehicle
+    stamps_ns, poses = vehicle.trajectory
+    ping_ns = np.concatenate([before[track].stamps_ns for track in own])
+    moved = np.vstack([after[track].T_map_sonar - before[track].T_map_sonar for track in own])
+    moved[:, 2] = wrap_angle(moved[:, 2])
+    order = np.argsort(ping_ns, kind="stable")
+    # Relative to the first: nanoseconds since 1970 do not fit a double.
+    start_ns = int(ping_ns.min())
+    at, known = stamps_ns - start_ns, ping_ns[order] - start_ns
+    new = poses + np.column_stack([np.interp(at, known, column) for column in moved[order].T])
+    new[:, 2] = wrap_angle(new[:, 2])
+    return dataclasses.replace(vehicle, trajectory=(stamps_ns, new))

@@ -1,0 +1,78 @@
+"""Pings of all vehicles in one map, each at its own pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.chart.refine import Track, refine_tracks
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.mapping.config import OccupancyConfig
+from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["PingTrack", "draw_chart", "refined"]
+
+FloatArray = NDArray[np.float64]
+
+_BLOCK_M, _BLOCK_CELLS = 0.5, 6.0
+"""A wall is straight within squares of this side, and as many cells of the map more."""
+_ROUNDED = 5
+"""Digits kept of metres and radians: an equation's last digits depend on the machine."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PingTrack:
+    """Pings of one vehicle in order of time, and ``T_map_sonar`` (K, 3) of each."""
+
+    pings: Sequence[DrawnPing]
+    T_map_sonar: FloatArray
+
+    def __post_init__(self) -> None:
+        expected = (len(self.pings), 3)
+        if self.T_map_sonar.shape != expected:
+            raise InvalidInputError(
+                f"T_map_sonar has shape {self.T_map_sonar.shape}, expected {expected}"
+            )
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Time of each ping (K,)."""
+        return np.array([ping.stamp_ns for ping in self.pings], dtype=np.int64)
+
+
+def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]:
+    """The same pings where all of them see the same walls; see `refine_tracks`."""
+    found = refine_tracks(
+        [Track(t.T_map_sonar, [p.points.astype(np.float64) for p in t.pings]) for t in tracks],
+        noise_m=resolution_m,
+        block_m=_BLOCK_M + _BLOCK_CELLS * resolution_m,
+    )
+    return [
+        PingTrack(track.pings, np.round(poses, _ROUNDED))
+        for track, poses in zip(tracks, found, strict=True)
+    ]
+
+
+def draw_chart(
+    tracks: Sequence[PingTrack], config: OccupancyConfig, log_odds_max: float
+) -> OccupancyMap | None:
+    """Draw all pings in one map, whose lattice goes through the frame's zero; None without any.
+
+    Parameters
+    ----------
+    config
+        Grid and sensor model.
+    log_odds_max
+        Limit of a cell's log-odds.
+    """
+    grid = GrowingGrid(config)
+    for track in tracks:
+        for ping, pose in zip(track.pings, track.T_map_sonar, strict=True):
+            grid.add(ping.detections(), SE2.from_array(pose))
+    return grid.trimmed().to_occupancy(log_odds_max) if grid.num_pings else None

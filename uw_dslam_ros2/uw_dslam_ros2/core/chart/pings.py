@@ -1,0 +1,78 @@
+"""Pings as they entered their submaps, kept to be drawn once more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sonar.types import Detections
+from uw_dslam_ros2.core.submap import SubmapId
+
+__all__ = ["DrawnPing", "KeptPings", "pack_ping"]
+
+Float32Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnPing:
+    """Echoes and free water of one ping, and where in its submap it was heard.
+
+    In single precision, and pings of one sonar share their bearings: what is kept of a ping is
+    its echoes, not its image. Fields are those of `Detections`.
+    """
+
+    stamp_ns: int
+    T_submap_sonar: SE2
+    points: Float32Array
+    weight: Float32Array
+    bearing_rad: NDArray[np.float64]
+    free_range_m: Float32Array
+    beamwidth_rad: float
+    range_sigma_m: float
+
+    def detections(self) -> Detections:
+        """In full."""
+        return Detections(
+            self.stamp_ns,
+            self.points.astype(np.float64),
+            self.weight.astype(np.float64),
+            self.bearing_rad,
+            self.free_range_m.astype(np.float64),
+            self.beamwidth_rad,
+            self.range_sigma_m,
+        )
+
+
+def pack_ping(
+    detections: Detections, T_submap_sonar: SE2, before: DrawnPing | None = None
+) -> DrawnPing:
+    """Keep a ping; `before` is the one before it, whose bearings may be the same."""
+    bearing_rad = detections.bearing_rad
+    if before is not None and np.array_equal(before.bearing_rad, bearing_rad):
+        bearing_rad = before.bearing_rad
+    return DrawnPing(
+        detections.stamp_ns,
+        T_submap_sonar,
+        detections.points.astype(np.float32),
+        detections.weight.astype(np.float32),
+        bearing_rad,
+        detections.free_range_m.astype(np.float32),
+        detections.beamwidth_rad,
+        detections.range_sigma_m,
+    )
+
+
+class KeptPings:
+    """Watches a mapper and keeps what enters its submaps; memory grows with the time."""
+
+    def __init__(self) -> None:
+        self.of_submap: dict[SubmapId, list[DrawnPing]] = {}
+        self._last: DrawnPing | None = None
+
+    def __call__(self, submap_id: SubmapId, detections: Detections, T_submap_sonar: SE2) -> None:
+        """Keep one ping."""
+        self._last = pack_ping(detections, T_submap_sonar, self._last)
+        self.of_submap.setdefault(submap_id, []).append(self._last)
