@@ -4,7 +4,8 @@ Missions are simulated in memory, in the harbour and in the lake. Each is examin
 once for each corruption of ``--only`` (default: all). "first" is the share in which the first
 warning names the cause, "mended" that in which the conventions found undo it and nothing else is
 changed, "wrongly" that in which they change what was right. ``--clean`` adds missions without a
-corruption, of other seeds.
+corruption, of other seeds: usual ones, short ones, ones with poor instruments and ones with few
+pings of a coarse sonar, in turns.
 """
 
 from __future__ import annotations
@@ -23,13 +24,28 @@ from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.sonar import SonarConfig
 from uw_dslam_ros2.io.examining import examine_readings
 from uw_dslam_ros2.io.readings import ImageEvent, Reading
+from uw_dslam_ros2.sim.instruments import InstrumentConfig
 from uw_dslam_ros2.sim.mission import MissionConfig, plan_mission
 from uw_dslam_ros2.sim.places import PLACES
 from uw_dslam_ros2.sim.readings import MissionReadings, mounting_of
+from uw_dslam_ros2.sim.sonar import SonarConfig as SimulatedSonar
 
 __all__ = ["add_arguments", "examined", "run"]
 
 _CLEAN_SEEDS = 1000
+_SHORT_S = 45.0
+_POOR = InstrumentConfig(
+    gyro_bias_deg_h=200.0,
+    angle_walk_deg_sqrt_h=3.0,
+    yaw_noise_rad=math.radians(0.5),
+    gyro_noise_rad_s=5e-3,
+    dvl_noise_m_s=0.03,
+    dvl_misalignment_rad=math.radians(1.0),
+    dvl_dropouts_per_min=3.0,
+    dvl_dropout_s=3.0,
+    dvl_outlier_share=0.02,
+)
+_COARSE = SimulatedSonar(num_beams=96, num_ranges=200, max_range_m=20.0)
 _NONE = "none"
 _ANGLE, _FACTOR, _DELAY_S = math.radians(4.0), 0.02, 0.15
 
@@ -133,32 +149,46 @@ def run(args: argparse.Namespace) -> int:
     if args.only:
         names = [name for name in names if name in args.only]
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    jobs = [(place, seed, names) for place in args.places for seed in seeds]
-    clean = range(_CLEAN_SEEDS, _CLEAN_SEEDS + args.clean)
-    jobs += [(args.places[seed % len(args.places)], seed, [_NONE]) for seed in clean]
+    usual = MissionConfig(num_vehicles=1, duration_s=args.duration)
+    jobs = [(replace(usual, place=p, seed=s), "usual", names) for p in args.places for s in seeds]
+    jobs += [(*_clean_mission(usual, args, number), [_NONE]) for number in range(args.clean)]
     rows: list[dict[str, Any]] = []
     cases: dict[str, list[Case]] = {}
-    for place, seed, wanted in progress(jobs, text="missions"):
-        config = MissionConfig(seed=seed, place=place, num_vehicles=1, duration_s=args.duration)
+    for config, kind, wanted in progress(jobs, text="missions"):
         source = MissionReadings(plan_mission(config))
         for name in wanted:
             case = examined(source, CORRUPTIONS[name])
             cases.setdefault(name, []).append(case)
-            rows.append(_row(place, seed, name, case))
+            rows.append(_row(config, kind, name, case))
             if not case.is_named(CORRUPTIONS[name]) or case.is_wrong(CORRUPTIONS[name]):
-                print(
-                    f"{place} {seed}, {name}: {'; '.join(case.details) or 'nothing'}", flush=True
-                )
+                said = "; ".join(case.details) or "nothing"
+                print(f"{config.place} {config.seed}, {kind}, {name}: {said}", flush=True)
     write_csv(args.out / "doctor.csv", rows)
     _print_summary(cases)
     return 0
 
 
-def _row(place: str, seed: int, name: str, case: Case) -> dict[str, Any]:
+def _clean_mission(
+    usual: MissionConfig, args: argparse.Namespace, number: int
+) -> tuple[MissionConfig, str]:
+    seed = _CLEAN_SEEDS + args.first_seed + number
+    base = replace(usual, place=args.places[number % len(args.places)], seed=seed)
+    kinds = {
+        "usual": base,
+        "short": replace(base, duration_s=_SHORT_S),
+        "poor instruments": replace(base, instruments=_POOR),
+        "few pings": replace(base, ping_rate_hz=1.0, sonar=_COARSE),
+    }
+    kind = list(kinds)[number // len(args.places) % len(kinds)]
+    return kinds[kind], kind
+
+
+def _row(config: MissionConfig, kind: str, name: str, case: Case) -> dict[str, Any]:
     corruption = CORRUPTIONS[name]
     return {
-        "place": place,
-        "seed": seed,
+        "place": config.place,
+        "seed": config.seed,
+        "mission": kind,
         "corruption": name,
         "kinds": " ".join(case.kinds),
         "named": int(case.is_named(corruption)),
