@@ -9,6 +9,7 @@ import pytest
 from uw_dslam_ros2.cli.doctor import main
 from uw_dslam_ros2.cli.mapping import sensor_config
 from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.sonar import SonarImage
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.recordings import BagWriter
 from uw_dslam_ros2.io.settings import SettingsFile
@@ -51,7 +52,7 @@ def test_what_is_wrong_is_told_and_mended(bag, tmp_path, capsys):
     assert main([str(bag), "--out", str(tmp_path / "first")]) == 0
     report = json.loads((tmp_path / "first" / "doctor.json").read_text())
     kinds = [finding["kind"] for finding in report["findings"]]
-    assert kinds == ["imu_no_orientation", "dvl_zero_without_lock", "cannot_tell"]
+    assert kinds == ["imu_no_orientation", "dvl_zero_without_lock", "no_sonar"]
     assert {stream["role"] for stream in report["vehicles"][0]["streams"]} == {"imu", "velocity"}
     out = capsys.readouterr().out
     assert "auv_1 imu: its orientation never changes" in out
@@ -63,9 +64,34 @@ def test_what_is_wrong_is_told_and_mended(bag, tmp_path, capsys):
     assert conventions == Conventions(imu_orientation="none", velocity_zero_is_invalid=True)
     assert main([str(bag), "--out", str(tmp_path / "second"), "--config", str(settings)]) == 0
     report = json.loads((tmp_path / "second" / "doctor.json").read_text())
-    assert [finding["kind"] for finding in report["findings"]] == ["cannot_tell"]
+    # With the orientation left out, the heading is what the rates make of it.
+    assert [f["kind"] for f in report["findings"]] == ["no_sonar", "no_heading"]
 
 
 def test_a_bag_that_is_not_there_is_bad_input(tmp_path, capsys):
     assert main([str(tmp_path / "nothing"), "--out", str(tmp_path / "out")]) == 2
     assert "nothing" in capsys.readouterr().err
+
+
+def test_what_reading_notices_is_told_too(tmp_path):
+    rng = np.random.default_rng(0)
+    path = tmp_path / "auv_1"
+    with BagWriter(path) as writer:
+        make = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
+        writer.add_topic("/auv_1/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+        for k in range(300):
+            stamp_ns = 1000 * SECOND + k * SECOND // 10
+            writer.write("/auv_1/imu", stamp_ns, make.imu(stamp_ns, "", 0.01 * k, 0.0, 0.1, 1e-6))
+            if k % 10 == 0:
+                smooth = np.sort(rng.integers(0, 255, (40, 30)), axis=0).astype(np.uint16)
+                image = SonarImage(
+                    stamp_ns, (smooth * 256 + 17).byteswap(), np.arange(1.0, 41.0),
+                    np.linspace(0.8, -0.8, 30),
+                )  # fmt: skip
+                writer.write("/auv_1/sonar", stamp_ns, make.sonar_image("head", image))
+    assert main([str(path), "--out", str(tmp_path / "out")]) == 0
+    report = json.loads((tmp_path / "out" / "doctor.json").read_text())
+    kinds = {finding["kind"] for finding in report["findings"]}
+    assert {"sonar_byte_order", "no_mounting", "no_velocity", "cannot_tell"} <= kinds
+    assert all(finding["vehicle_id"] == "auv_1" for finding in report["findings"])

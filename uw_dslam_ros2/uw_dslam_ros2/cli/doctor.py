@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,9 @@ from uw_dslam_ros2.cli.mapping import mountings_of, sensor_config
 from uw_dslam_ros2.cli.outcome import json_bytes
 from uw_dslam_ros2.core.clocks import find_gaps
 from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.doctor import Examination
 from uw_dslam_ros2.core.findings import WORDS, Finding
+from uw_dslam_ros2.core.health import MappedVehicle, SensorCount, sensor_findings
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.events import VehicleReader
@@ -32,6 +34,11 @@ from uw_dslam_ros2.io.vehicles import VehicleRecording, find_recordings
 __all__ = ["main"]
 
 _FEW_MOTIONS = 15
+_PIXELS = {
+    "compressed": "a root of an echo's amplitude (compressed for display)",
+    "amplitude": "an echo's amplitude",
+    "power": "an echo's power",
+}
 _TURNING_CELL_M = 0.25
 """Beams of a sonar that turns lie a degree or two apart: finer cells hold nothing more."""
 
@@ -125,8 +132,17 @@ def _diagnose(
         ]
         mountings = mountings_of(recording, sensors, reader.transforms())
         stamps = reader.stamps
-    examined = examine_recording(recording, sensors, mapper.sonar, stamps, mountings.of)
+    messages = _Messages()
+    examined = examine_recording(
+        recording, sensors, mapper.sonar, stamps, mountings.of, messages.note
+    )
     findings += examined.findings
+    findings += [
+        dataclasses.replace(finding, vehicle_id=recording.vehicle_id)
+        for finding in messages.findings
+    ]
+    findings += mountings.findings(recording.vehicle_id)
+    findings += sensor_findings(messages.vehicle(recording.vehicle_id, stamps, examined))
     findings += [
         Finding(
             "gap",
@@ -136,17 +152,10 @@ def _diagnose(
         )
         for gap in find_gaps(stamps)
     ]
-    if examined.num_ping_motions < _FEW_MOTIONS and not examined.num_turning_windows:
-        findings.append(
-            Finding(
-                "cannot_tell",
-                "sonar",
-                "too few pings or turns show how it moved (few echoes, little way, or no imu), so "
-                "the conventions of imu, dvl and sonar cannot be told from each other",
-                severity="info",
-                vehicle_id=recording.vehicle_id,
-            )
-        )
+    findings += [
+        Finding("cannot_tell", role, detail, severity="info", vehicle_id=recording.vehicle_id)
+        for role, detail in _left_open(examined, stamps)
+    ]
     return Diagnosis(
         recording.vehicle_id,
         _streams(recording, stamps),
@@ -158,6 +167,63 @@ def _diagnose(
         examined.num_turning_windows,
         examined.is_turning,
     )
+
+
+def _left_open(
+    examined: Examination, stamps: Mapping[str, NDArray[np.int64]]
+) -> Iterator[tuple[str, str]]:
+    """Which sensors could not be judged, and why."""
+    if "sonar" not in stamps:
+        return
+    if examined.num_ping_motions < _FEW_MOTIONS and not examined.num_turning_windows:
+        yield (
+            "sonar",
+            f"only {examined.num_ping_motions} pairs of pings a second or two apart show how it "
+            "moved (too few echoes, too seldom, or no imu), so the conventions of imu, dvl and "
+            "sonar cannot be told from each other",
+        )
+    elif "velocity" in stamps and not (
+        examined.is_velocity_judged or examined.num_turning_windows
+    ):
+        yield (
+            "velocity",
+            "too few of the sonar's motions lie within its messages, so its axes, unit and delay "
+            "cannot be told",
+        )
+
+
+class _Messages:
+    """What reading says of the messages themselves, gathered over several passes."""
+
+    def __init__(self) -> None:
+        self.findings: list[Finding] = []
+        self._counts: dict[str, SensorCount] = {}
+
+    def note(self, reader: VehicleReader) -> None:
+        """Take what a pass found; a role that was passed over counts no message as empty."""
+        self.findings += [finding for finding in reader.findings if finding not in self.findings]
+        for role, count in reader.counts.items():
+            known = self._counts.get(role, SensorCount(0))
+            self._counts[role] = SensorCount(
+                count.num,
+                max(count.num_bad, known.num_bad),
+                max(count.num_empty, known.num_empty),
+                known.problem or count.problem,
+            )
+
+    def vehicle(
+        self, vehicle_id: str, stamps: Mapping[str, NDArray[np.int64]], examined: Examination
+    ) -> MappedVehicle:
+        """The vehicle as far as it is known before it is mapped."""
+        known = {role: s[s > 0] for role, s in stamps.items()}
+        return MappedVehicle(
+            vehicle_id,
+            {r: count for r, count in self._counts.items() if count.num and r != "truth"},
+            {},
+            spans={r: (int(s.min()), int(s.max())) for r, s in known.items() if len(s)},
+            has_yaw=examined.has_yaw,
+            has_yaw_rate=examined.has_yaw_rate,
+        )
 
 
 def _streams(
@@ -186,9 +252,11 @@ def _print(diagnosis: Diagnosis) -> None:
             f"{s.rate_hz:.3g} Hz, {s.start_s:.1f} to {s.end_s:.1f} s"
         )
     if diagnosis.is_turning:
-        print(f"  examined by {diagnosis.num_turning_windows} spans of a sonar that turns")
+        print(f"  examined by {diagnosis.num_turning_windows} spans of turns or slow pings")
     else:
         print(f"  examined by {diagnosis.num_ping_motions} motions from ping to ping")
+    if diagnosis.pixels:
+        print(f"  the sonar's pixels hold {_PIXELS[diagnosis.pixels]}, by their speckle")
 
 
 def _settings(diagnoses: Sequence[Diagnosis]) -> str:

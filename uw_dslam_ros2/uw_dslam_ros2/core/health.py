@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.clocks import Gap
 from uw_dslam_ros2.core.findings import Finding
 
-__all__ = ["MappedVehicle", "SensorCount", "health_findings"]
+__all__ = ["MappedVehicle", "SensorCount", "health_findings", "sensor_findings"]
 
 _MANY = 20
 """Fewer messages or matches than this say nothing in shares."""
@@ -62,6 +62,18 @@ class MappedVehicle:
         """One of the mapper's counters; 0 where it has none."""
         value = self.counts.get(name, 0)
         return int(value) if isinstance(value, int | float) and math.isfinite(value) else 0
+
+
+def sensor_findings(vehicle: MappedVehicle) -> list[Finding]:
+    """What can be told before anything is mapped: which sensors are there, and say something."""
+    found: list[Finding] = []
+
+    def tell(kind: str, role: str, detail: str) -> None:
+        found.append(Finding(kind, role, detail, vehicle_id=vehicle.vehicle_id))
+
+    _check_sensors(vehicle, tell)
+    _check_overlap(vehicle, tell)
+    return found
 
 
 def health_findings(vehicle: MappedVehicle) -> list[Finding]:

@@ -39,6 +39,7 @@ def examine_recording(
     sonar: SonarConfig,
     stamps: Mapping[str, NDArray[np.int64]],
     mounting_of: MountingOf,
+    note: Callable[[VehicleReader], None] | None = None,
 ) -> Examination:
     """Try the conventions of a vehicle's sensors.
 
@@ -46,12 +47,15 @@ def examine_recording(
     ----------
     stamps : role -> times (N,) [ns] of all its messages, as `VehicleReader.check_clocks` has them.
     mounting_of : ``T_base_sensor`` (4, 4) of a reading.
+    note : called with the reader after each pass, for what it says of the messages.
     """
 
     def source(is_wanted: IsWanted) -> Iterable[Event]:
         with VehicleReader(recording, sensors) as reader:
             reader.stamps = dict(stamps)
             yield from reader.events(is_wanted)
+            if note is not None:
+                note(reader)
 
     return examine_readings(
         source, sensors.conventions, sonar, stamps, mounting_of, recording.vehicle_id

@@ -25,6 +25,10 @@ class Examination:
     """Kinds of findings that the conventions or the front end's settings mend."""
     sonar_changes: dict[str, str] = field(default_factory=dict)
     """Settings of the sonar's front end (`SonarConfig`) that mend what was found."""
+    has_yaw: bool = True
+    has_yaw_rate: bool = True
+    is_velocity_judged: bool = False
+    """Whether enough motions of the echoes lay within known velocities."""
     pixels: str = ""
     """What the sonar's images hold: compressed, amplitude or power; "" where it cannot be told."""
 

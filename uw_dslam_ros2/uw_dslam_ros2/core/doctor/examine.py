@@ -52,6 +52,8 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
     `pings` are bursts: each but the last of a burst has another about a second later.
     """
     result = Examination(pixels=pings.pixels or "")
+    result.has_yaw = bool(np.isfinite(navigation.yaw_rad).any())
+    result.has_yaw_rate = bool(np.isfinite(navigation.yaw_rate_rad_s).any())
     if pings.pixels == "power" and pings.pixels_read_as == "amplitude":
         _say_power(result, vehicle_id)
     if len(navigation.imu_s) < _MIN_READINGS:
@@ -138,6 +140,7 @@ class _Trial:
         chosen = reading
         delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), _SURE)
         fit = self._fit(chosen, delays.velocity_after_imu_s)
+        self._result.is_velocity_judged = fit is not None
         if fit is not None and fit.is_mirrored:
             self._say_velocity_mirrored(fit)
         self._say_delays(delays)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.mounting import ForwardAxis
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.drivers.adapter import Adapter, key_of, stamp_of
@@ -22,6 +23,13 @@ __all__ = ["ADAPTERS", "read_projected", "read_raw"]
 _PIXEL_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _NUM_IMAGES = 10  # that are asked for the order of their bytes
 _CLEARLY = 0.3
+_BY_BEAM = Finding(
+    "sonar_data_order",
+    "sonar",
+    "its images are stored beam by beam, not range by range; they are read so "
+    "(data_order: beam_major)",
+    severity="info",
+)
 
 
 def read_projected(msg: Any, settings: ReadSettings) -> Sequence[ImageEvent]:
@@ -128,6 +136,8 @@ def _order_of(pixels: NDArray[Any], settings: ReadSettings) -> str:
         sums[1] += _alike(flat, num_beams, power) - _alike(flat, num_ranges, power)
         if sums[0] >= _NUM_IMAGES:
             is_by_beam = sums[1] / sums[0] < -_CLEARLY
+            if is_by_beam:
+                settings.tell_once(_BY_BEAM)
             settings.memory["data_order"] = "beam_major" if is_by_beam else "range_major"
         return "beam_major" if sums[1] / sums[0] < -_CLEARLY else "range_major"
     return "range_major"
