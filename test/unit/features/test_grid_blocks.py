@@ -22,7 +22,7 @@ def _map(values: np.ndarray, resolution_m: float) -> OccupancyMap:
     return OccupancyMap(GridSpec(resolution_m, *values.shape, POSE), values)
 
 
-@pytest.mark.parametrize("side", [3, 4, 8])
+@pytest.mark.parametrize("side", [2, 3, 4, 8])
 @pytest.mark.parametrize("cut", [(0, 0), (1, 2)])
 def test_every_cell_of_an_enlarged_map_keeps_its_value_and_place(rng, side, cut):
     large = _map(_enlarged(_random(rng), side)[cut[0] :, cut[1] :].copy(), 0.05)

@@ -14,8 +14,9 @@ from uw_dslam_ros2.core.se2 import SE2
 __all__ = ["shrink_blocks"]
 
 _MOST_CELLS = 32
-_LEAST_CELLS = 3  # two cells a block do the filters no harm
-_SHARE_AT_EDGES = 0.9  # of the changes between neighbours; a third at most by chance
+_LEAST_CELLS = 2  # specks of 2 x 2 cells pass for lines
+_SHARE_AT_EDGES = 0.9  # of the changes between neighbours; a third at most by chance ...
+_SHARE_OF_PAIRS = 0.98  # ... and half of them, of blocks of two cells
 _MIN_EDGES = 8  # fewer say nothing: any two lie on some lattice
 _MIN_SIDE_BLOCKS = 40
 
@@ -23,7 +24,7 @@ _MIN_SIDE_BLOCKS = 40
 def shrink_blocks(occupancy: OccupancyMap) -> OccupancyMap:
     """The map with one cell for each block, in the same frame; itself where there are none.
 
-    Blocks are squares of 3 to 32 cells on a lattice that may begin anywhere; cells that were
+    Blocks are squares of 2 to 32 cells on a lattice that may begin anywhere; cells that were
     changed after the enlarging are allowed for.
     """
     values = occupancy.values
@@ -42,7 +43,8 @@ def _phase(changes: NDArray[np.int64], side: int) -> int | None:
     """Where the first block edge lies if most changes lie on edges of such blocks, or None."""
     total = np.bincount(np.arange(1, len(changes) + 1) % side, changes, side)
     phase = int(total.argmax())
-    if total.sum() == 0 or total[phase] < _SHARE_AT_EDGES * total.sum():
+    least = _SHARE_OF_PAIRS if side == 2 else _SHARE_AT_EDGES
+    if total.sum() == 0 or total[phase] < least * total.sum():
         return None
     num_edges = np.count_nonzero(changes[(phase - 1) % side :: side])
     return phase if num_edges >= _MIN_EDGES else None

@@ -109,10 +109,10 @@ def _detail_share(points: FloatArray) -> float:
     if len(points) == 0:
         return 0.0
     some = points[:: -(-len(points) // _MOST_LINE_POINTS)]
-    is_left = off_strongest_lines(
+    left = off_strongest_lines(
         np.ascontiguousarray(some), _NUM_LINES, _NUM_LINE_ANGLES, _LINE_HALF_WIDTH_CELLS
     )
-    return float(is_left.mean())
+    return float(left.mean())
 
 
 def _common_area(source: WallMap, target: WallMap, T_target_source: SE2) -> tuple[float, float]:

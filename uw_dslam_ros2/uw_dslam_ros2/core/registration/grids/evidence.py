@@ -30,6 +30,7 @@ __all__ = ["Found", "Judge", "is_same_pose", "refine", "weigh"]
 
 FloatArray = NDArray[np.float64]
 _NUM_REFINED = 12
+_PRICE = 0.5  # of cells twice as large: so much more must the best pose convince on them
 _SAME_CELLS = 8.0  # poses nearer than that, in cells of their level, are one answer
 
 
@@ -90,7 +91,8 @@ def weigh(
     for judge in (Judge(sides, pyramid, background) for sides in scales):
         pairs = sorted(((c, judge.evidence(c)) for c in refined), key=logit, reverse=True)
         judged.append((judge, pairs))
-    judge, weighed = max(judged, key=lambda one: logit(one[1][0]))
+    worth = [logit(pairs[0]) - _PRICE * k for k, (_, pairs) in enumerate(judged)]
+    judge, weighed = judged[worth.index(max(worth))]
     best, _ = weighed[0]
     apart = [p for p in weighed[1:] if not is_same_pose(finest, p[0].pose, best.pose)]
     kept, poses = zip(weighed[0], *apart, strict=True)

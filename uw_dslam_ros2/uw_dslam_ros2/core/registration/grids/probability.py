@@ -67,7 +67,6 @@ class MatchEvidence:
 
 ENOUGH_DETAIL = 600.0
 """More cells of detail are no more proof: chance matches of large maps have them too."""
-_LIKE_DEVIATIONS = 2.0  # by how many standard errors a rival that is the true pose may agree less
 # Wall cells next to each other agree or not together: so many count as one (design effect, the
 # scatter of sums over squares against that of independent cells: 2.5 to 6 in noisy maps).
 _CELLS_PER_SAMPLE = 5.0
@@ -95,7 +94,7 @@ class VerdictModels:
 
 
 MODELS = VerdictModels(
-    pose=(-2.1782, 5.6615, -18.5572, 0.9167, -6.7008, 0.819, -0.2288),
+    pose=(-1.7782, 5.6615, -18.5572, 1.15, -6.7008, 0.819, -0.2288),
     match=(0.3367, 0.7635, -1.1911),
 )
 """Fitted by `study verdict` with its default settings, which prints them."""
@@ -107,7 +106,7 @@ def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
     return (
         agreement.agreement,
         agreement.conflict,
-        math.log1p(min(agreement.num_detail, ENOUGH_DETAIL)),
+        math.log1p(min(agreement.num_detail, ENOUGH_DETAIL) / _CELLS_PER_SAMPLE),
         agreement.wall_share,
         math.log(min(max(pose.surprise, 0.5), 30.0)),
         log_volume,
@@ -116,27 +115,25 @@ def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
 
 def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tuple[float, ...]:
     """Logit of the best pose for itself, and how convincing its strongest rival is, from 0 up."""
-    best, *rivals = (
-        _logit(pose_model, pose_features(pose, evidence.log_volume))
-        for pose in (evidence.best, *_serious_rivals(evidence))
-    )
+    best = _logit(pose_model, pose_features(evidence.best, evidence.log_volume))
+    rivals = [
+        _logit(pose_model, pose_features(rival, evidence.log_volume)) - _doubt(evidence, rival)
+        for rival in evidence.rivals
+    ]
     return best, math.log1p(math.exp(max(rivals))) if rivals else 0.0
 
 
-def _serious_rivals(evidence: MatchEvidence) -> list[PoseEvidence]:
-    """Rivals that may be the true pose of a place that looks like itself.
+def _doubt(evidence: MatchEvidence, rival: PoseEvidence) -> float:
+    """What speaks against a rival as the true pose of a place that looks like itself.
 
     The true pose agrees as well as its alias, for the maps are the same, and in the same kind of
     detail. What agrees significantly less is repeated walls: the best pose would have to agree
-    better by chance than the true one.
+    better by chance than the true one, with a likelihood of exp(-z^2 / 2) at z standard errors.
     """
-    best = evidence.best.agreement
-    return [
-        rival
-        for rival in evidence.rivals
-        if _lead(best, rival.agreement) < _LIKE_DEVIATIONS
-        and rival.agreement.num_detail >= _LIKE_DETAIL * best.num_detail
-    ]
+    best, other = evidence.best.agreement, rival.agreement
+    if other.num_detail < _LIKE_DETAIL * best.num_detail:
+        return 2.0 * _MOST_LOGIT
+    return 0.5 * max(_lead(best, other), 0.0) ** 2
 
 
 def probability_of(
@@ -148,8 +145,7 @@ def probability_of(
     """
     if is_alone:
         evidence = replace(evidence, rivals=())
-    logit = _logit(models.match, match_features(evidence, models.pose))
-    return 1.0 / (1.0 + math.exp(-logit))
+    return _share(_logit(models.match, match_features(evidence, models.pose)))
 
 
 def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MODELS) -> float:
@@ -158,14 +154,16 @@ def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MO
 
 
 def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
-    """How probable the most convincing serious rival would be if the best pose were not there."""
-    return max(
-        (
-            probability_of(replace(evidence, best=rival), models, is_alone=True)
-            for rival in _serious_rivals(evidence)
-        ),
-        default=0.0,
-    )
+    """How probable the most convincing rival would be if the best pose were not there."""
+    logits = [
+        pose_logit(rival, evidence.log_volume, models) - _doubt(evidence, rival)
+        for rival in evidence.rivals
+    ]
+    return _share(_logit(models.match, (max(logits), 0.0))) if logits else 0.0
+
+
+def _share(logit: float) -> float:
+    return 1.0 / (1.0 + math.exp(-logit))
 
 
 def _lead(best: Agreement, rival: Agreement) -> float:
