@@ -118,3 +118,20 @@ def test_where_turns_cannot_be_compared_nothing_is_said(reason):
     found = examined(navigation, beams)
     assert found.num_turning_windows == 0
     assert found.findings == []
+
+
+def test_velocities_that_are_wrong_now_and_then_spoil_nothing():
+    turning = replace(TURN, zero_rad=math.radians(94.0), is_clockwise=True)
+    navigation, beams = recording(1, turning, delay_s=0.8)
+    velocity = navigation.velocity_m_s.copy()
+    velocity[::25] += 4.0
+    found = examined(replace(navigation, velocity_m_s=velocity), beams)
+    assert found.conventions.sonar_is_mirrored
+    assert found.conventions.sonar_yaw_offset_rad == pytest.approx(turning.zero_rad, abs=0.05)
+
+
+def test_a_delay_that_the_imu_shows_by_itself_is_told_once():
+    navigation, beams = recording(2, delay_s=0.8)
+    found = Examination(conventions=Conventions(imu_delay_s=0.8))
+    examine_turning(found, navigation, beams, choose_spans(navigation, beams.stamp_s))
+    assert found.findings == []

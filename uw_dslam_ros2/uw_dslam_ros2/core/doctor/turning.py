@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from uw_dslam_ros2.core.doctor.fits import at_times
 from uw_dslam_ros2.core.doctor.sample import NavigationSample
@@ -176,7 +177,8 @@ def _held(grid: FloatArray, known_s: FloatArray, known: FloatArray) -> FloatArra
     """Interpolate over dropouts, hold beyond the ends; NaN where nothing is known."""
     if len(known_s) == 0:
         return np.full(len(grid), np.nan)
-    return np.asarray(np.interp(grid, known_s, known))
+    # A velocity that is wrong by metres is wrong for one message.
+    return np.asarray(np.interp(grid, known_s, median_filter(known, 3, mode="nearest")))
 
 
 class TurningTrial:

@@ -45,6 +45,13 @@ def examine_turning(
     yaw = _yaw_of(result, navigation)
     if yaw is None:
         return
+    if result.conventions.velocity_zero_is_invalid:
+        is_said = navigation.velocity_m_s.any(axis=1)
+        navigation = replace(
+            navigation,
+            velocity_s=navigation.velocity_s[is_said],
+            velocity_m_s=navigation.velocity_m_s[is_said],
+        )
     trial = TurningTrial(beams, navigation, yaw, spans)
     result.num_turning_windows = trial.num_windows
     if trial.num_windows:
@@ -190,9 +197,11 @@ class _Judge:
 
     def _judge_delay(self, best: TurningFit) -> None:
         delay_s = best.reading.delay_s
-        still = self._trial.score(replace(best.reading, delay_s=0.0))
+        # What the imu says against itself may have shown the same delay already.
+        known_s = self._result.conventions.imu_delay_s
+        still = self._trial.score(replace(best.reading, delay_s=known_s))
         sure = confidence_of(best, still)
-        if abs(delay_s) < _MIN_DELAY_S or sure < _SURE:
+        if abs(delay_s - known_s) < _MIN_DELAY_S or sure < _SURE:
             return
         way = "later" if delay_s > 0.0 else "earlier"
         self._add(
