@@ -82,19 +82,24 @@ def chained_covariance(
 
 def compose_covariance(covariance: FloatArray, left: SE2, middle: SE2, right: SE2) -> FloatArray:
     """Covariance of ``left @ middle @ right`` when that of `middle` is given."""
-    arm = middle.rotation() @ (right.x, right.y)
-    jacobian = np.eye(3)
-    jacobian[:2, :2] = left.rotation()
-    jacobian[:2, 2] = left.rotation() @ (-arm[1], arm[0])
+    # Written out: products of such small matrices are mostly the making of them.
+    cos, sin = math.cos(middle.yaw), math.sin(middle.yaw)
+    x, y = cos * right.x - sin * right.y, sin * right.x + cos * right.y
+    cos, sin = math.cos(left.yaw), math.sin(left.yaw)
+    jacobian = np.array(
+        [[cos, -sin, -cos * y - sin * x], [sin, cos, -sin * y + cos * x], [0.0, 0.0, 1.0]]
+    )
     return jacobian @ covariance @ jacobian.T
 
 
 def invert_covariance(covariance: FloatArray, motion: SE2) -> FloatArray:
     """Covariance of ``motion.inverse()`` when that of `motion` is given."""
     back = motion.inverse()
-    jacobian = -np.eye(3)
-    jacobian[:2, :2] = -back.rotation()
-    jacobian[:2, 2] = back.rotation() @ (-motion.y, motion.x)
+    cos, sin = math.cos(back.yaw), math.sin(back.yaw)
+    x, y = -motion.y, motion.x
+    jacobian = np.array(
+        [[-cos, sin, cos * x - sin * y], [-sin, -cos, sin * x + cos * y], [0.0, 0.0, -1.0]]
+    )
     return jacobian @ covariance @ jacobian.T
 
 

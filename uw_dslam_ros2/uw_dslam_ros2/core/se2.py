@@ -15,6 +15,7 @@ __all__ = ["SE2", "wrap_angle"]
 
 FloatArray = NDArray[np.float64]
 _TWO_PI = 2.0 * math.pi
+_set = object.__setattr__
 
 
 @overload
@@ -42,11 +43,16 @@ class SE2:
     yaw: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "yaw"):
-            value = float(getattr(self, name))
-            if not math.isfinite(value):
-                raise InvalidInputError(f"SE2.{name} is {value}, expected a finite number")
-            object.__setattr__(self, name, wrap_angle(value) if name == "yaw" else value)
+        # Written out: graphs of many submaps make these by the hundred thousand.
+        x, y, yaw = float(self.x), float(self.y), float(self.yaw)
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(yaw)):
+            for name, value in zip(("x", "y", "yaw"), (x, y, yaw), strict=True):
+                if not math.isfinite(value):
+                    raise InvalidInputError(f"SE2.{name} is {value}, expected a finite number")
+        wrapped = (yaw + math.pi) % _TWO_PI - math.pi
+        _set(self, "x", x)
+        _set(self, "y", y)
+        _set(self, "yaw", -math.pi if wrapped >= math.pi else wrapped)
 
     def __matmul__(self, other: SE2) -> SE2:
         """Compose: ``T_a_c = T_a_b @ T_b_c``."""

@@ -61,14 +61,12 @@ def cycle_of(first: Edge, second: Edge, source: Side, target: Side) -> tuple[SE2
         target.covariance(second.target, first.target),
     ]
     total = np.zeros((3, 3))
-    for index, covariance in enumerate(covariances):
-        left, right = SE2(), SE2()
-        for motion in motions[:index]:
-            left = left @ motion
-        for motion in motions[index + 1 :]:
-            right = right @ motion
-        total += compose_covariance(covariance, left, motions[index], right)
-    return motions[0] @ motions[1] @ motions[2] @ motions[3], total
+    left = SE2()
+    rights = [motions[1] @ motions[2] @ motions[3], motions[2] @ motions[3], motions[3], SE2()]
+    for motion, right, covariance in zip(motions, rights, covariances, strict=True):
+        total += compose_covariance(covariance, left, motion, right)
+        left = left @ motion
+    return left, total
 
 
 def cycle_distance(first: Edge, second: Edge, source: Side, target: Side) -> float:
