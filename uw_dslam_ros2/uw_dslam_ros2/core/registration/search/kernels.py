@@ -714,7 +714,7 @@ def _bound(total, bounds, state, box, key, is_unseen, keep, wanted, scratch):
     size = box[3] * total.arm + max(box[4], box[5])
     if upper <= wanted or size > bounds.small:
         return upper
-    level = min(int(2.0 * math.log2(bounds.small / max(size, 1e-300))), worth.shape[0] - 1)
+    level = min(int(2.0 * np.log2(bounds.small / max(size, 1e-300))), worth.shape[0] - 1)
     # What seldom helps in boxes of that size is tried now and then only.
     is_tried = is_unseen or wanted < best[0] or worth[level] > 0.7
     if not is_tried and state.counters[NUM_BOXES] & 14 != 0:
