@@ -430,6 +430,35 @@ def test_what_is_left_is_asked_when_told_to_settle(manage):
     assert min(asked) >= 60.0
 
 
+def test_known_start_poses_say_where_maps_are_searched(manage):
+    options = []
+
+    def refuse(request, response):
+        options.append((request.source.header.frame_id, request.options))
+        response.result = RegisterMaps.Response.DONE
+        response.registration.verdict = response.registration.AMBIGUOUS
+        return response
+
+    first, second = two_submaps()
+    T_room = T_ROOM["auv_1"].inverse() @ T_ROOM["auv_2"]
+    poses = ["auv_1 0 0 0", f"auv_2 {T_room.x} {T_room.y} {T_room.yaw}"]
+    settings = {"start_poses": poses, "start_error_m": 2.0, "start_error_rad": 0.2}
+    with manage(has_server=False, **settings, **FAST) as (until, probe, _):
+        probe.node.create_service(RegisterMaps, "/some/register_maps", refuse)
+        probe.send(first)
+        probe.send(second)
+        until(lambda: options, "a question")
+    frame_id, asked = options[0]
+    T_expected = T_room if frame_id.startswith("auv_2") else T_room.inverse()
+    assert asked.has_prior
+    T_prior = SE2(asked.prior.x, asked.prior.y, asked.prior.yaw)
+    assert T_prior.distance_to(T_expected)[0] < 1e-6
+    # Twice the error of a start, and what the headings turn the far map by.
+    distance_m = np.hypot(T_expected.x, T_expected.y)
+    assert asked.prior_half_width_m == pytest.approx(4.0 + 0.2 * distance_m)
+    assert asked.prior_half_width_rad == pytest.approx(0.4)
+
+
 def test_provenance_is_saved_with_the_map(manage, tmp_path):
     with manage(has_server=False, **FAST) as (until, probe, call):
         probe.send(room_submap("auv_1"))

@@ -4,6 +4,7 @@ from uw_dslam_ros2.core.merging.components import LoopError
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.growing_map import GrowingMap, GrowingMapConfig, MapChange
 from uw_dslam_ros2.core.merging.queue import MapQueue
+from uw_dslam_ros2.core.merging.start_poses import StartPoses
 from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
@@ -26,6 +27,7 @@ __all__ = [
     "MapQueueConfig",
     "MatchRequest",
     "QueueState",
+    "StartPoses",
     "SubmapRecord",
     "SubmapState",
 ]

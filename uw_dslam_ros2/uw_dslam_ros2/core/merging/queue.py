@@ -248,6 +248,10 @@ class MapQueue:
         drawn = self._drawn()
         return None if drawn is None else drawn.take_changed()
 
+    def T_odom_submap(self, submap_id: SubmapId) -> SE2:  # noqa: N802 (notation of motions)
+        """Pose of a submap that is held in its run's odom frame, by its newest revision."""
+        return self._submaps[submap_id].submap.T_odom_submap
+
     def T_map_odom(self, vehicle_id: str) -> SE2 | None:  # noqa: N802 (notation of motions)
         """Place of the odom frame of a vehicle's newest run; None unless that run is merged."""
         merged = self._merged()

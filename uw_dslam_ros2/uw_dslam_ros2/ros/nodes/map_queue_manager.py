@@ -28,9 +28,10 @@ from uw_dslam_ros2.core.merging import (
     MapQueue,
     MapQueueConfig,
     MatchRequest,
+    StartPoses,
     SubmapState,
 )
-from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
+from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.session import load_session
@@ -82,6 +83,9 @@ class MapQueueManager(Node):
         self._queue_config = declare_config(self, MapQueueConfig, "queue")
         growing_config = declare_config(self, GrowingMapConfig, "maps")
         refuse_unknown_parameters(self)
+        self._start_poses = StartPoses.of_texts(
+            self._config.start_poses, self._config.start_error_m, self._config.start_error_rad
+        )
         self._queue = MapQueue(self._queue_config)
         self._message = "waiting for submaps"
         self._idle = IdleTimeout(self._config.quiet_s)
@@ -256,7 +260,8 @@ class MapQueueManager(Node):
             # A server's own time limit would let a busy machine refuse what a quiet one accepts;
             # the number of boxes decides, and this is for what never ends.
             max_seconds = _SEARCH_SHARE * self._config.request_timeout_s
-            msg = RegisterMaps.Request(options=options_to_msg(request.prior, max_seconds))
+            prior = request.prior or self._start_prior(request)
+            msg = RegisterMaps.Request(options=options_to_msg(prior, max_seconds))
             frames = (
                 submap_frame_id(request.source_reference),
                 submap_frame_id(request.target_reference),
@@ -267,6 +272,12 @@ class MapQueueManager(Node):
                 self._asked[request.request_id] = request
             else:
                 self._queue.cancel_request(request.request_id)
+
+    def _start_prior(self, request: MatchRequest) -> PriorWindow | None:
+        """What the vehicles' start poses say of the maps in a request."""
+        ends = request.source_reference, request.target_reference
+        places = [(i.vehicle_id, self._queue.T_odom_submap(i)) for i in ends]
+        return self._start_poses.window(*places[0], *places[1])
 
     def _on_answer(self, request_id: int, response: RegisterMaps.Response) -> None:
         request = self._asked.get(request_id)

@@ -71,7 +71,16 @@ class MapQueueManagerConfig(Config):
     is_discovering_maps: bool = setting(
         False,
         doc="take every topic <vehicle>/map of a vehicle that sends no submaps, too",
+    )
+    start_poses: tuple[str, ...] = setting(
+        (),
+        doc='poses of own map frames in a shared frame, where known: ["robot1 x y yaw", ...] '
+        "[m, rad]; their maps are matched near there and nowhere else",
         is_basic=True,
+    )
+    start_error_m: float = setting(5.0, 0.01, 1000.0, "how far each start pose may be wrong [m]")
+    start_error_rad: float = setting(
+        0.3, 0.001, 3.2, "how far each start pose may be turned [rad]"
     )
     servers: tuple[str, ...] = setting(
         (),
