@@ -105,8 +105,9 @@ class _GrowingPlanner:
         for answer in self._claims.get(pair, ()):
             if answer.use < Use.CLAIM:
                 continue
+            # The whole tracks: submaps that have come since lie between those that were asked.
             sides = [
-                self._library.side_of(group.ids)
+                self._library.track_side(group.reference.track)
                 for group in (answer.query.source, answer.query.target)
             ]
             constraints = self._verifier.constraints_of(answer.query, sides[0], sides[1])
