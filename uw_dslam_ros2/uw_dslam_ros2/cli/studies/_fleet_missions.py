@@ -20,7 +20,7 @@ from uw_dslam_ros2.sim.mission import MissionConfig
 from uw_dslam_ros2.sim.recording import simulate_mission
 from uw_dslam_ros2.sim.sonar import SonarConfig
 
-__all__ = ["FleetMission", "code_digest", "mapped_bags", "simulated_mission"]
+__all__ = ["FleetMission", "code_digest", "demo_mission", "mapped_bags", "simulated_mission"]
 
 _PARTS = ("sim", "core/sonar", "core/navigation", "core/mapping", "core/registration")
 
@@ -50,7 +50,15 @@ def simulated_mission(
         truth_resolution_m=0.1,
         sonar=SonarConfig(num_beams=128, num_ranges=250),
     )
-    name = f"{place}_{seed}"
+    return _cached(f"{place}_{seed}", config, cache)
+
+
+def demo_mission(seed: int, cache: Path) -> FleetMission:
+    """Simulate and map the mission of ``./uw demo``, or take it from the cache."""
+    return _cached(f"demo_{seed}", MissionConfig(seed=seed), cache)
+
+
+def _cached(name: str, config: MissionConfig, cache: Path) -> FleetMission:
     folder = cache / f"{name}_{code_digest(repr(config.to_dict()), *_PARTS)}"
     if not (folder / "done").exists():
         with TemporaryDirectory() as work:

@@ -64,7 +64,7 @@ from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
 from uw_dslam_ros2.sim.fleets import answer_all, known_overlap, make_result
 from uw_dslam_ros2.sim.places import PLACES
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["add_arguments", "merged_largest", "placing_error", "run"]
 
 FloatArray = NDArray[np.float64]
 Placing = dict[SubmapId, SE2]
@@ -207,13 +207,38 @@ def _merged(mission: FleetMission, method: _Method) -> tuple[Placing, int, float
     for submap in mission.submaps:
         queue.add_submap(submap)
     num_searches = answer_all(queue, method.matcher)
+    return _largest(queue), num_searches, time.process_time() - begun_s
+
+
+def _largest(queue: MapQueue) -> Placing:
     groups: dict[int, Placing] = {}
     for record in queue.submaps():
         groups.setdefault(record.component, {})[record.submap.submap_id] = (
             record.T_component_submap
         )
-    largest = max(groups.values(), key=len)
-    return largest, num_searches, time.process_time() - begun_s
+    return max(groups.values(), key=len)
+
+
+def merged_largest(mission: FleetMission) -> tuple[Placing, set[SubmapId]]:
+    """Largest group of submaps that the engine joins: their poses, and who was matched."""
+    queue = MapQueue()
+    for submap in mission.submaps:
+        queue.add_submap(submap)
+    answer_all(queue, _engine)
+    matched = {
+        submap_id
+        for answer, is_used in queue.answers()
+        for submap_id in (*answer.query.source.ids, *answer.query.target.ids)
+        if is_used and answer.query.prior is not None
+    }
+    return _largest(queue), matched
+
+
+def placing_error(mission: FleetMission, placing: Placing) -> float:
+    """RMSE [m] of the trajectories of placed submaps."""
+    submaps = [submap for submap in mission.submaps if submap.submap_id in placing]
+    paths = _trajectories(submaps, placing)
+    return float(trajectory_error(paths, mission.truth.trajectories).rmse_m)
 
 
 def _true_placing(mission: FleetMission) -> Placing:

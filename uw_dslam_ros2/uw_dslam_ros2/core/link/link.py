@@ -55,7 +55,7 @@ class AcousticLink:
         self.counts = LinkCounts()
         self._outbox = Outbox()
         self._own: dict[LayerKey, OutItem] = {}
-        self._layers: dict[tuple[int, int], dict[Layer, bytes]] = {}
+        self._sources: dict[tuple[int, int], Submap] = {}
         self._inboxes: dict[int, Inbox] = {}
         self._items: dict[int, dict[int, bytes]] = {}
         self._names: dict[int, str] = {config.number: name}
@@ -77,8 +77,8 @@ class AcousticLink:
             raise InvalidInputError(
                 f"submap of {submap.vehicle_id!r} on the link of {self._name!r}"
             )
-        layers = encode_submap(submap, self._key)
-        self._layers[submap.run_id & 0xFFFF, submap.sequence] = layers
+        layers = encode_submap(submap, self._key, Layer.COARSE)
+        self._sources[submap.run_id & 0xFFFF, submap.sequence] = submap
         for layer in (Layer.OUTLINE, Layer.COARSE):
             self._say(LayerKey.of(submap.run_id, submap.sequence, layer), layers[layer])
         self._rank_cells()
@@ -112,6 +112,10 @@ class AcousticLink:
         """The vehicle with that number; None while it is not known."""
         return self._names.get(sender)
 
+    def number_of(self, vehicle_id: str) -> int | None:
+        """The number of a vehicle; None while it is not known."""
+        return next((n for n, name in self._names.items() if name == vehicle_id), None)
+
     def _say(self, key: LayerKey, data: bytes) -> None:
         item, content = self._own.get(key), layer_item(key, data)
         self._take_layer(self._config.number, key, data)
@@ -136,11 +140,13 @@ class AcousticLink:
             item.rank = _CELLS_RANK + 0.4 / (1.0 + 0.1 * max(likeness, default=0.0))
 
     def _offer(self, key: LayerKey) -> None:
-        """Send a finer layer, and those below it."""
-        layers = self._layers.get((key.run, key.sequence), {})
-        for layer in Layer:
-            if layer in layers and layer <= key.layer:
-                self._say(LayerKey(key.run, key.sequence, layer), layers[layer])
+        """Send a finer layer, and those below it; nothing where the full map is not here."""
+        submap = self._sources.get((key.run, key.sequence))
+        if key in self._own or submap is None:
+            return
+        for layer, data in encode_submap(submap, self._key, key.layer).items():
+            if layer > Layer.COARSE:
+                self._say(LayerKey(key.run, key.sequence, layer), data)
 
     # --- packets out -------------------------------------------------------------------------
 
@@ -388,7 +394,6 @@ class AcousticLink:
                 key, data = read_layer(body)
                 link._own[key] = item
                 link._take_layer(config.number, key, data)
-                link._layers.setdefault((key.run, key.sequence), {})[key.layer] = data
         for sender, (epoch, items) in state.received.items():
             inbox = link._inboxes[sender] = Inbox(epoch)
             link._items[sender] = dict(items)

@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _STEPS = np.array([0.05, 0.05, 2.0 * math.pi / 256])  # of x, y [m] and yaw [rad]
-_TOLERANCES = np.array([0.15, 0.15, 0.15])
+_TOLERANCES = np.array([0.12, 0.12, 0.1])
 _STAMP_NS = 1_000_000
 _TENTH_NS = 100_000_000
 _EVERY_NS = 1_000_000_000
@@ -32,7 +32,7 @@ def write_path(writer: ByteWriter, stamps_ns: IntArray, poses: FloatArray) -> No
     """Write stamps (K,), increasing, and poses (K, 3) [x, y, yaw], thinned.
 
     Knots are added where the curve through them is farthest off, until it is nowhere more than
-    0.15 m (a coordinate) and 0.15 rad off.
+    0.12 m (a coordinate) and 0.1 rad off.
     """
     if len(poses) == 0:
         writer.varint(0)

@@ -1,0 +1,60 @@
+import pytest
+from unit.merging.fleet import map_bytes, three_vehicles
+
+from uw_dslam_ros2.core.link import Layer
+from uw_dslam_ros2.core.link.channel import ChannelConfig
+from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
+from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
+from uw_dslam_ros2.sim.link_mission import run_link
+
+
+def queue_of(events, fleet, is_growing):
+    """A manager that gets submaps as they come, and has them registered meanwhile."""
+    queue = MapQueue(MapQueueConfig(anchor_vehicle="auv_1"))
+    matcher = KnowingMatcher(fleet)
+    queue.is_growing = is_growing
+    # What pins the frame is what comes first; the order of the others must not matter.
+    first = next(event for event in events if event[1].submap_id == ("auv_1", 0, 0))
+    for number, (_, submap) in enumerate([first, *events]):
+        queue.add_submap(submap)
+        if is_growing and number % 5 == 4:
+            answer_all(queue, matcher)
+    queue.is_growing = False
+    answer_all(queue, matcher)
+    return queue
+
+
+@pytest.mark.slow
+def test_all_who_have_received_the_same_have_the_same_map():
+    fleet = three_vehicles()
+    run = run_link(list(fleet.submaps.values()), ChannelConfig(loss=0.3, seed=3), limit_s=600.0)
+    orders = [[s.submap_id for _, s in events] for events in run.known.values()]
+    assert len(set(map(tuple, orders))) == 3, "each received them in another order"
+    queues = [queue_of(events, fleet, k == 1) for k, events in enumerate(run.known.values())]
+    maps = [map_bytes(queue) for queue in queues]
+    assert maps[0] == maps[1] == maps[2] != b""
+    assert all(record.component == 0 for record in queues[2].submaps())
+
+
+def test_detail_comes_for_what_is_asked():
+    fleet = three_vehicles(num_submaps=2)
+    details = {("auv_2", 0, 1)}
+    run = run_link(list(fleet.submaps.values()), ChannelConfig(), limit_s=600.0, details=details)
+    wanted = {i: 4 * s.revision + Layer.COARSE for i, s in fleet.submaps.items()}
+    wanted[next(iter(details))] = Layer.FINE
+    done_s = run.complete_s(wanted)
+    assert done_s is not None
+    assert run.complete_s(wanted | {("auv_1", 0, 0): Layer.FINE}) is None
+    finest = {n: max(s.revision for _, s in events) for n, events in run.known.items()}
+    assert set(finest.values()) == {Layer.FINE}
+    assert sum(c.duplicates for c in run.counts.values()) == 0
+
+
+def test_nobody_knows_a_submap_before_it_is_closed():
+    fleet = three_vehicles(num_submaps=2)
+    run = run_link(list(fleet.submaps.values()), ChannelConfig(), limit_s=600.0)
+    begin_ns = min(s.trajectory_stamp_ns[0] for s in fleet.submaps.values())
+    for events in run.known.values():
+        for at_s, submap in events:
+            closed = fleet.submaps[submap.submap_id].stamp_ns
+            assert at_s >= (closed - begin_ns) * 1e-9 - 1e-6
