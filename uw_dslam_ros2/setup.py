@@ -1,7 +1,6 @@
 """Build description of the ament_python package uw_dslam_ros2."""
 
 from glob import glob
-from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -19,9 +18,6 @@ COMMANDS = (
     "view",
 )
 
-# The settings live at the top of the repository and are installed with the package built there.
-CONFIG = sorted(glob("../config/*.yaml")) if Path("../config").is_dir() else []
-
 setup(
     name=NAME,
     version="0.1.0",
@@ -34,7 +30,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
         (f"share/{NAME}/rviz", sorted(glob("rviz/*.rviz"))),
-        (f"share/{NAME}/config", CONFIG),
+        (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
     ],
     install_requires=["setuptools"],
     zip_safe=True,

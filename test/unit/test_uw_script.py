@@ -34,7 +34,7 @@ def checkout(tmp_path: Path) -> Path:
         (folder / "uw_dslam_ros2" / name).mkdir()
     for name in ("setup.py", "setup.cfg", "package.xml"):
         shutil.copy(ROOT / "uw_dslam_ros2" / name, folder / "uw_dslam_ros2")
-    shutil.copytree(ROOT / "config", folder / "config")
+    shutil.copytree(ROOT / "uw_dslam_ros2" / "config", folder / "uw_dslam_ros2" / "config")
     return folder
 
 
