@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, SampleCollector, examine
-from uw_dslam_ros2.core.doctor.bursts import choose_pings
+from uw_dslam_ros2.core.doctor.bursts import choose_pings, more_bursts
+from uw_dslam_ros2.core.doctor.ping_motion import share_with_echoes
 from uw_dslam_ros2.core.doctor.turning_verdict import choose_spans, examine_turning
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
@@ -94,6 +95,11 @@ def examine_readings(
         chosen = choose_pings(ping_s, navigation.imu_s, navigation.yaw_rate_rad_s)
         wanted = {int(stamp_ns) for stamp_ns in ping_ns[chosen]}
         collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in wanted)
+        share = share_with_echoes(collector.pings())
+        if not collector.is_turning and (num_bursts := more_bursts(ping_s, share)):
+            chosen = choose_pings(ping_s, navigation.imu_s, navigation.yaw_rate_rad_s, num_bursts)
+            more = {int(stamp_ns) for stamp_ns in ping_ns[chosen]} - wanted
+            collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in more)
     found = examine(collector.navigation(), collector.pings(), vehicle_id)
     if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):
         found.is_turning = True

@@ -37,7 +37,10 @@ class Delays:
 
 
 def find_delays(
-    turns: list[TurnFit], way: Callable[[float], VelocityFit | None], sure: float
+    turns: list[TurnFit],
+    way: Callable[[float], VelocityFit | None],
+    sure: float,
+    likely: float,
 ) -> Delays:
     """Tell the three clocks apart as far as the echoes show it.
 
@@ -45,7 +48,7 @@ def find_delays(
     ----------
     turns : of `fit_turns`: best, other sign, without delay.
     way : fit of the velocity when its stamps are so much later than the IMU's [s].
-    sure : confidence from which a delay is believed.
+    sure : confidence from which a delay is believed; of the velocity, from `likely` on.
     """
     best, still = turns[0], turns[2]
     against_imu_s = best.delay_s
@@ -60,7 +63,7 @@ def find_delays(
         if moved is None or abs(moved_s) < _MIN_WAY_DELAY_S:
             return Delays()
         by_way = confidence_of(moved.cost, together.cost)
-        return Delays(velocity_s=moved_s, confidence=by_way) if by_way > sure else Delays()
+        return Delays(velocity_s=moved_s, confidence=by_way) if by_way > likely else Delays()
     # The sonar and the IMU differ: the DVL goes with one of them.
     with_sonar = way(against_imu_s)
     is_imu = 0.5

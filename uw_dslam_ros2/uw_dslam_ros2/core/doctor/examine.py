@@ -32,6 +32,7 @@ __all__ = ["examine"]
 FloatArray = NDArray[np.float64]
 
 _SURE = 0.99
+_LIKELY = 0.95  # enough to tell of a late dvl, not to correct it
 _MIN_MOTIONS = 15
 _MIN_READINGS = 20
 _MAX_TURN_COST = 1.5
@@ -133,12 +134,12 @@ class _Trial:
         elif fits[0].sign < 0:
             reading = self._handedness()
         if reading is None:
-            self._say_delays(find_delays(fits, lambda _: None, _SURE))
+            self._say_delays(find_delays(fits, lambda _: None, _SURE, _LIKELY))
             return
         if reading == _Reading():
             reading = self._velocity_side(reading)
         chosen = reading
-        delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), _SURE)
+        delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), _SURE, _LIKELY)
         fit = self._fit(chosen, delays.velocity_after_imu_s)
         self._result.is_velocity_judged = fit is not None
         if fit is not None and fit.is_mirrored:
@@ -365,13 +366,14 @@ class _Trial:
                 sonar_delay_s=round(delays.sonar_s, 3),
             )
         if delays.velocity_s:
+            is_sure = delays.confidence > _SURE
             self._add(
                 "velocity_delay",
                 "velocity",
                 f"its stamps are {_late(delays.velocity_s)} than those of sonar and imu, by how "
                 f"the echoes move (conventions.velocity_delay_s: {delays.velocity_s:.2f})",
                 delays.confidence,
-                velocity_delay_s=round(delays.velocity_s, 3),
+                **({"velocity_delay_s": round(delays.velocity_s, 3)} if is_sure else {}),
             )
 
 

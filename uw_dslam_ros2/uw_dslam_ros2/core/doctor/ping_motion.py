@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.doctor.sample import PingSample
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["PingMotions", "ping_motions"]
+__all__ = ["PingMotions", "ping_motions", "share_with_echoes"]
 
 FloatArray = NDArray[np.float64]
 
@@ -44,6 +44,12 @@ class PingMotions:
         """Covariances (M, 3, 3); a free direction has `free_sigma` [m, m, rad]."""
         weak = np.diag(1.0 / np.square(free_sigma))
         return np.asarray(np.linalg.inv(self.information + weak))
+
+
+def share_with_echoes(pings: PingSample) -> float:
+    """Which share of the pings has enough echoes to be matched; 1 where there is no ping."""
+    enough = [len(points) >= _MIN_POINTS for points in pings.points]
+    return float(np.mean(enough)) if enough else 1.0
 
 
 def ping_motions(pings: PingSample, min_gap_s: float, max_gap_s: float) -> PingMotions:
