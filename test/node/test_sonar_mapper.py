@@ -267,6 +267,44 @@ def test_bad_messages_are_told_and_survived(ros_context, spinning):
         assert "4 pings mapped" in finish(until, vehicle).message
 
 
+def test_odometry_does_not_jump_where_the_map_is_corrected(ros_context, spinning):
+    """A new run, like a closed loop, moves the frame; depth and noise of the velocity are told."""
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        drive(until, vehicle, range(4))
+        drive(until, vehicle, range(20, 24))  # 16 s without anything
+        until(lambda: int(vehicle.values().get("num_restarts", "0")) >= 1, "the new run")
+        finish(until, vehicle)
+        last_ns = START_NS + 23_900_000_000
+        until(lambda: stamp_of(vehicle.odometry[-1]) == last_ns, "the last odometry")
+    x = np.array([msg.pose.pose.position.x for msg in vehicle.odometry])
+    assert np.abs(np.diff(x)).max() < 3 * SPEED_M_S * 0.1
+    # The new run's own map begins at zero again; its frame says where odometry lies in it.
+    T_map_odom = vehicle.frames["auv_1/map", "auv_1/odom"].transform.translation.x
+    assert T_map_odom + x[-1] == pytest.approx(SPEED_M_S * 3.9, abs=0.2)
+    covariance = np.reshape(vehicle.odometry[-1].twist.covariance, (6, 6))
+    assert 0.0 < covariance[0, 0] < 1.0
+    assert covariance[5, 5] > 0.0
+    assert vehicle.odometry[-1].pose.covariance[14] == 1e6  # no depth was measured
+
+
+def test_frames_can_be_named_and_transforms_left_to_others(ros_context, spinning):
+    vehicle = Vehicle(ros_context)
+    settings = {"publishes_tf": False, "map_frame": "chart", "odom_frame": "reckoning"}
+    mapper = mapper_of(ros_context, **settings)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        drive(until, vehicle, range(2))
+        finish(until, vehicle)
+        until(lambda: vehicle.maps and vehicle.odometry, "results")
+    assert vehicle.maps[-1].header.frame_id == "chart"
+    assert vehicle.odometry[-1].header.frame_id == "reckoning"
+    assert vehicle.frames == {}
+
+
 def test_an_unknown_frame_is_named_and_taken_to_look_ahead(ros_context, spinning):
     vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
     with spinning(mapper, vehicle.node) as until:
@@ -283,17 +321,18 @@ def test_recording_that_begins_again_begins_a_new_run_and_keeps_the_old_one(ros_
     with spinning(mapper, vehicle.node) as until:
         until(vehicle.is_connected, "connection")
         vehicle.send_mount()
+        drive(until, vehicle, range(8))
+        until(lambda: vehicle.values().get("num_scan") == "16", "the first round")
         drive(until, vehicle, range(4))
-        until(lambda: vehicle.values().get("num_scan") == "8", "the first round")
-        drive(until, vehicle, range(3))
         until(lambda: int(vehicle.values().get("num_restarts", "0")) >= 1, "the restart")
         response = finish(until, vehicle)
         until(lambda: len(vehicle.submaps) == 2, "a submap of each run")
-    assert "14 pings mapped" in response.message
+    assert "24 pings mapped" in response.message
     first, second = (submap_from_msg(msg) for msg in vehicle.submaps)
     assert first.run_id != second.run_id
-    assert (len(first.trajectory), len(second.trajectory)) == (8, 6)
-    assert vehicle.odometry[-1].pose.pose.position.x < 4 * SPEED_M_S
+    assert (len(first.trajectory), len(second.trajectory)) == (16, 8)
+    # Odometry goes on; only its frame is elsewhere in the map of the new run.
+    assert vehicle.odometry[-1].pose.pose.position.x == pytest.approx(SPEED_M_S * 11.8, abs=0.1)
 
 
 def test_one_late_message_changes_nothing(ros_context, spinning):

@@ -124,11 +124,21 @@ def test_a_clock_that_all_follow_was_set(start):
 def test_after_a_jump_those_are_waited_for_that_have_not_followed_yet():
     order = jumping()
     order.offer("imu", 500, "a")
-    assert order.offer("imu", 530, "b")
+    assert not order.offer("imu", 629, "b")
+    assert order.offer("imu", 630, "c")
     order.begin_anew()
-    assert drained(order) == []
-    order.offer("dvl", 505, "c")
-    assert drained(order) == ["a", "c"]
+    order.offer("dvl", 605, "d")
+    assert drained(order) == ["a", "d"]
+
+
+def test_queues_that_are_emptied_one_after_the_other_make_one_jump():
+    order = jumping()
+    for name in ("dvl", "imu"):
+        said = [order.offer(name, stamp, f"{name} {stamp}") for stamp in (1010, 5000, 5030)]
+        assert said == [False, False, name == "imu"]
+    assert list(order.rest()) == ["dvl 1010", "imu 1010"]
+    order.begin_anew()
+    assert drained(order) == ["dvl 5000", "imu 5000", "dvl 5030", "imu 5030"]
 
 
 def test_a_jump_that_one_sensor_makes_alone_is_none():

@@ -253,6 +253,38 @@ class VehicleMapper:
         return self._estimator.poses[-1] @ self._navigation.relative_at(stamp_ns)[0]
 
     @property
+    def T_smooth_base(self) -> SE2:  # noqa: N802 (a motion)
+        """Where the vehicle is now, in a frame that loop closures do not move: it drifts.
+
+        Raises `InvalidInputError` before the first navigation message.
+        """
+        stamp_ns = self._navigation.stamp_ns
+        if stamp_ns is None:
+            raise InvalidInputError("there is no pose yet, expected navigation messages first")
+        return self._navigation.pose_at(stamp_ns)[0]
+
+    @property
+    def smooth_covariance(self) -> FloatArray:
+        """Covariance (3, 3) of `T_smooth_base`, order x, y, yaw."""
+        stamp_ns = self._navigation.stamp_ns
+        if stamp_ns is None:
+            raise InvalidInputError("there is no pose yet, expected navigation messages first")
+        return self._navigation.pose_at(stamp_ns)[1]
+
+    @property
+    def velocity_covariance(self) -> FloatArray:
+        """Covariance (3, 3) of `velocity`: forward, left [m/s], yaw rate [rad/s]."""
+        stamp_ns = self._navigation.stamp_ns
+        if stamp_ns is None:
+            raise InvalidInputError("there is no velocity yet, expected navigation messages first")
+        return self._navigation.velocity_covariance_at(stamp_ns)
+
+    @property
+    def depth_m(self) -> float:
+        """Depth below the surface as last measured; NaN where it is not."""
+        return float(self._counts["depth_m"])
+
+    @property
     def pose_covariance(self) -> FloatArray:
         """Covariance (3, 3) of `T_odom_base`, order x, y, yaw, in odom."""
         stamp_ns = self._navigation.stamp_ns

@@ -179,6 +179,11 @@ class NavigationFilter:
         current = np.array([cos * state[9] + sin * state[10], -sin * state[9] + cos * state[10]])
         return (1.0 + state[7]) * state[3:5] + current, float(state[5])
 
+    def velocity_covariance_at(self, stamp_ns: int) -> FloatArray:
+        """Covariance (3, 3) of body velocity [m/s], forward and left, and yaw rate [rad/s]."""
+        _, covariance = self._at(stamp_ns)
+        return covariance[3:6, 3:6].copy()
+
     def sensor_errors(self) -> dict[str, float]:
         """What the filter believes of its sensors now."""
         if not self._records:

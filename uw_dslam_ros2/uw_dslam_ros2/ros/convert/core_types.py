@@ -15,7 +15,7 @@ import math
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMsg
 from geometry_msgs.msg import Point32, Pose, PoseStamped, PoseWithCovariance, Quaternion
-from nav_msgs.msg import OccupancyGrid, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_msgs.msg import Transform2D
@@ -31,6 +31,7 @@ __all__ = [
     "covariance_to_list",
     "occupancy_from_msg",
     "occupancy_to_msg",
+    "odometry_to_msg",
     "path_to_msg",
     "pose_from_msg",
     "pose_to_msg",
@@ -46,6 +47,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 _PLANAR_ROWS = np.array([0, 1, 5])  # x, y, yaw in a covariance of x y z roll pitch yaw
+_DEPTH_SIGMA_M = 0.1
+_UNKNOWN_VARIANCE = 1e6
 _MAX_TILT = 1e-3  # [rad]
 _NORM_TOLERANCE = 1e-3
 MAX_GRID_CELLS = 2**30
@@ -120,6 +123,34 @@ def pose_with_covariance_to_msg(T_frame_body: SE2, covariance: FloatArray) -> Po
     full[np.ix_(_PLANAR_ROWS, _PLANAR_ROWS)] = covariance
     msg = PoseWithCovariance(pose=pose_to_msg(T_frame_body))
     msg.covariance = full.ravel()
+    return msg
+
+
+def odometry_to_msg(
+    T_odom_base: SE2,
+    covariance: FloatArray,
+    velocity_m_s: FloatArray,
+    yaw_rate_rad_s: float,
+    velocity_covariance: FloatArray,
+    depth_m: float,
+) -> Odometry:
+    """Odometry without header and frames.
+
+    Covariances (3, 3) are of x, y, yaw, and of forward and left velocity and yaw rate. Without a
+    depth (NaN) z is 0 with a variance that says that nothing is known of it.
+    """
+    msg = Odometry(pose=pose_with_covariance_to_msg(T_odom_base, covariance))
+    is_known = math.isfinite(depth_m)
+    msg.pose.pose.position.z = -depth_m if is_known else 0.0
+    full = np.asarray(msg.pose.covariance).reshape(6, 6)
+    full[2, 2] = _DEPTH_SIGMA_M**2 if is_known else _UNKNOWN_VARIANCE
+    msg.pose.covariance = full.ravel()
+    msg.twist.twist.linear.x = float(velocity_m_s[0])
+    msg.twist.twist.linear.y = float(velocity_m_s[1])
+    msg.twist.twist.angular.z = float(yaw_rate_rad_s)
+    full = np.diag([0.0, 0.0, *[_UNKNOWN_VARIANCE] * 3, 0.0])  # z, roll, pitch: not measured
+    full[np.ix_(_PLANAR_ROWS, _PLANAR_ROWS)] = velocity_covariance
+    msg.twist.covariance = full.ravel()
     return msg
 
 

@@ -10,7 +10,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -22,6 +24,7 @@ from uw_dslam_msgs.srv import GetSubmap
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
 from uw_dslam_ros2.core.mapping import RunBreak, VehicleMapper, VehicleMapperConfig, VehicleRuns
+from uw_dslam_ros2.core.pose_graph import compose_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
 from uw_dslam_ros2.io.conventions import correct, correct_mounting
@@ -31,8 +34,8 @@ from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.readings import PINGS, TransformEvent
 from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_to_msg,
+    odometry_to_msg,
     path_to_msg,
-    pose_with_covariance_to_msg,
     stamp_to_msg,
     submap_to_msg,
 )
@@ -83,6 +86,10 @@ class SonarMapper(Node):
                 "give one of them (-r __ns:=/auv_1)"
             )
         self._base_frame = self._config.base_frame or f"{self._vehicle_id}/base_link"
+        self._map_frame = self._config.map_frame or f"{self._vehicle_id}/map"
+        self._odom_frame = self._config.odom_frame or f"{self._vehicle_id}/odom"
+        self._T_odom_base = self._T_odom_run = SE2()
+        self._smooth_mapper: VehicleMapper | None = None
         self._runs = VehicleRuns(self._mapper_config, self._vehicle_id, _draw_run_id)
         self._order: StampOrder[SensorEvent] = StampOrder(
             int(self._reorder_s() * 1e9),
@@ -162,7 +169,7 @@ class SonarMapper(Node):
         self._map_pub = self.create_publisher(OccupancyGrid, "map", LATCHED)
         self._path_pub = self.create_publisher(Path, "path", LATCHED)
         self._odom_pub = self.create_publisher(Odometry, "odom", DEFAULT)
-        self._broadcaster = FrameBroadcaster(self)
+        self._broadcaster = FrameBroadcaster(self) if self._config.publishes_tf else None
 
     def _subscribe(self, sensor: SensorInput) -> None:
         """Listen to a topic, and no more to the one that had its role before."""
@@ -400,27 +407,40 @@ class SonarMapper(Node):
     def _publish_odometry(self, stamp_ns: int) -> None:
         self._odom_stamp_ns = stamp_ns
         stamp = stamp_to_msg(stamp_ns)
-        odom_frame, T_odom_base = f"{self._vehicle_id}/odom", self._mapper.T_odom_base
-        velocity_m_s, yaw_rate_rad_s = self._mapper.velocity
-        msg = Odometry(child_frame_id=self._base_frame)
-        msg.header.stamp = stamp
-        msg.header.frame_id = odom_frame
-        msg.pose = pose_with_covariance_to_msg(T_odom_base, self._mapper.pose_covariance)
-        msg.twist.twist.linear.x = float(velocity_m_s[0])
-        msg.twist.twist.linear.y = float(velocity_m_s[1])
-        msg.twist.twist.angular.z = float(yaw_rate_rad_s)
-        self._odom_pub.publish(msg)
-        self._broadcaster.send(
-            transform_to_msg(stamp, f"{self._vehicle_id}/map", odom_frame, SE2()),
-            transform_to_msg(stamp, odom_frame, self._base_frame, T_odom_base),
+        mapper = self._mapper
+        if self._smooth_mapper is not mapper:
+            # A new run begins at its own zero; odometry goes on from where it was.
+            self._T_odom_run = self._T_odom_base @ mapper.T_smooth_base.inverse()
+            self._smooth_mapper = mapper
+        self._T_odom_base = self._T_odom_run @ mapper.T_smooth_base
+        msg = odometry_to_msg(
+            self._T_odom_base,
+            _turned(mapper.smooth_covariance, self._T_odom_run),
+            *mapper.velocity,
+            mapper.velocity_covariance,
+            mapper.depth_m,
         )
+        msg.header.stamp = stamp
+        msg.header.frame_id, msg.child_frame_id = self._odom_frame, self._base_frame
+        self._odom_pub.publish(msg)
+        if self._broadcaster is not None:
+            # Loop closures, and where a new run lies, move the frame and not the odometry.
+            T_map_odom = mapper.T_odom_base @ self._T_odom_base.inverse()
+            T_odom_base = transform_to_msg(
+                stamp, self._odom_frame, self._base_frame, self._T_odom_base
+            )
+            T_odom_base.transform.translation.z = msg.pose.pose.position.z
+            self._broadcaster.send(
+                transform_to_msg(stamp, self._map_frame, self._odom_frame, T_map_odom),
+                T_odom_base,
+            )
 
     def _publish_map(self, stamp_ns: int) -> None:
         self._map_stamp_ns = stamp_ns
         stamps_ns, poses = self._mapper.trajectory()
         if not len(poses):
             return
-        frame_id = f"{self._vehicle_id}/map"
+        frame_id = self._map_frame
         with self._drawing.turn():
             occupancy = self._mapper.vehicle_map()
             self._map_pub.publish(occupancy_to_msg(occupancy, frame_id, stamp_ns))
@@ -499,6 +519,11 @@ class SonarMapper(Node):
             return "info", ""
         text = "; ".join(f"{name}: no message for {age_s:.0f} s" for name, age_s in silent.items())
         return "error" if max(silent.values()) > _LOST_S else "warning", text
+
+
+def _turned(covariance: NDArray[np.float64], T_odom_run: SE2) -> NDArray[np.float64]:
+    """The covariance (3, 3) of a pose in the run's own frame, in odom."""
+    return compose_covariance(covariance, T_odom_run, SE2(), SE2())
 
 
 def _draw_run_id() -> int:

@@ -38,6 +38,13 @@ class SonarMapperConfig(SensorConfig):
     map_period_s: float = setting(
         2.0, 0.1, 3600.0, "between two maps, by the pings' stamps and by a steady clock [s]"
     )
+    map_frame: str = setting(
+        "", doc="frame of the vehicle's map, which loop closures correct; empty: <vehicle>/map"
+    )
+    odom_frame: str = setting("", doc="frame in which odometry never jumps; empty: <vehicle>/odom")
+    publishes_tf: bool = setting(
+        True, doc="send the vehicle's map -> odom -> base_link on /tf; else only the topics"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +95,9 @@ class MapQueueManagerConfig(Config):
         is_basic=True,
     )
     map_frame: str = setting("map", doc="frame of the global map", is_basic=True)
+    publishes_tf: bool = setting(
+        True, doc="send map -> <vehicle>/map on /tf; else only in merge_status"
+    )
     requests_per_server: int = setting(2, 1, 1000, "registrations asked of one server at a time")
     request_timeout_s: float = setting(
         180.0, 0.1, 86400.0, "a registration not answered by then is asked again [s]"

@@ -31,7 +31,8 @@ class StampOrder[ItemT]:
     hold_ns : how long a stream is waited for, in the time of the stamps.
     back_ns : an item that lies further back in its stream is put aside.
     ahead_ns : an item that lies further ahead of the youngest of all is put aside.
-    believe_ns : a jump that has lasted for so long is one.
+    believe_ns : a jump that has lasted for so long is one, if all streams have made it; for those
+        that have not it is waited for `hold_ns` longer.
     """
 
     def __init__(
@@ -78,8 +79,11 @@ class StampOrder[ItemT]:
             if len(aside) > _MAX_ASIDE:
                 aside.popleft()
                 self.num_late += 1
-            since_ns = self._aside_since_ns.setdefault(stream, stamp_ns)
-            return stamp_ns - since_ns >= self._believe_ns
+            lasted_ns = stamp_ns - self._aside_since_ns.setdefault(stream, stamp_ns)
+            # The others follow, or are not heard of any more: queues are emptied in any order.
+            have_followed = self._alive <= self._aside.keys()
+            wait_ns = 0 if have_followed else self._hold_ns
+            return lasted_ns >= self._believe_ns + wait_ns
         # The old time goes on: what is aside of this stream came late, and another stream's jump
         # would have to last anew.
         self.num_late += len(self._aside.pop(stream, ()))
