@@ -146,6 +146,42 @@ def test_two_vehicles_become_one_map(manage):
     assert (occupancy.values[cells[:, 0], cells[:, 1]] > 50).mean() > 0.9
 
 
+def test_vehicles_that_are_not_joined_have_a_group_and_a_frame_of_their_own(manage):
+    with manage(has_server=False, **FAST) as (until, probe, _):
+        for submap in two_submaps():
+            probe.send(submap)
+        until(lambda: ("map_auv_2", "auv_2/map") in probe.transforms, "the frame of the other")
+        until(lambda: len(probe.statuses[-1].groups) == 2, "the groups")
+        groups = probe.statuses[-1].groups
+        assert [(g.component, g.frame_id, list(g.vehicle_ids)) for g in groups] == [
+            (0, "map", ["auv_1"]),
+            (1, "map_auv_2", ["auv_2"]),
+        ]
+        probe.send(room_submap("auv_0"))  # whose name comes first, while nobody is joined
+        until(lambda: ("map", "auv_0/map") in probe.transforms, "the frame that has moved")
+        until(lambda: ("map_auv_1", "auv_1/map") in probe.transforms, "the other's new parent")
+
+
+def test_a_name_belongs_to_the_topic_that_had_it_first(manage):
+    first, second = two_submaps()
+    with manage(has_server=False, **FAST) as (until, probe, _):
+        probe.send(first)
+        until(lambda: probe.num_merged == 1, "the submap")
+        thief = probe.node.create_publisher(SubmapMsg, "/thief/submap", SUBMAPS)
+        stolen = dataclasses.replace(second, vehicle_id="auv_1", run_id=7)
+        thief.publish(submap_to_msg(stolen))
+        until(lambda: "auv_1 is heard on /auv_1/submap" in probe.statuses[-1].message, "refusal")
+        assert len(probe.states()) == 1
+
+
+def test_transforms_can_be_left_to_others(manage):
+    with manage(has_server=False, publishes_tf=False, **FAST) as (until, probe, _):
+        probe.send(room_submap("auv_1"))
+        until(lambda: probe.num_merged == 1, "the submap")
+        until(lambda: probe.maps, "the map")
+        assert probe.transforms == {}
+
+
 def test_submaps_wait_for_a_server_that_starts_late(manage, ros_context):
     with manage(has_server=False, **FAST) as (until, probe, _):
         for submap in two_submaps():

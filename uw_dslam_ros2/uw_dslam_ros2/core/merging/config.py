@@ -10,6 +10,8 @@ __all__ = [
     "INLIER_PROBABILITY",
     "LOG_ODDS_MAX",
     "MAX_CHECKS",
+    "MAX_MAP_CELLS",
+    "MAX_MAP_SIDE",
     "NUM_NEIGHBOURS",
     "VAGUE_CELLS",
     "MapQueueConfig",
@@ -27,6 +29,9 @@ LOG_ODDS_MAX = 8.0
 """Limit of the log-odds of merged cells: twice that of a vehicle's own map, so that two that
 agree are surer than one, and a third can still change it.
 """
+MAX_MAP_SIDE = 20_000
+"""Rows and columns of the largest map that is made whole, to be sent, written or matched."""
+MAX_MAP_CELLS = 100_000_000
 INLIER_PROBABILITY = 0.99
 """Share of right edges that the chi-square test of an edge keeps."""
 
@@ -57,6 +62,12 @@ class MapQueueConfig(Config):
     )
     max_partners: int = setting(
         4, 1, 1000, "vehicles that each vehicle is matched with at first, most promising first"
+    )
+    max_speed_m_s: float = setting(
+        10.0,
+        0.1,
+        1e4,
+        "submaps of a run that its vehicle would have to be faster for are set aside [m/s]",
     )
     growth: float = setting(
         1.5,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 
-__all__ = ["MapShape", "promise", "shape_of"]
+__all__ = ["NO_SHAPE", "MapShape", "promise", "shape_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +30,10 @@ class MapShape:
 
     histogram: FloatArray
     wall_length_m: float
+
+
+NO_SHAPE = MapShape(np.zeros(_NUM_BINS), 0.0)
+"""Of a map without walls."""
 
 
 def shape_of(occupancy: OccupancyMap) -> MapShape:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
+from uw_dslam_ros2.core.merging.config import MAX_MAP_CELLS, MAX_MAP_SIDE
+from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap, joint_box, lattice_box
 from uw_dslam_ros2.core.merging.types import MapProvenance
 from uw_dslam_ros2.core.mosaic import Mosaic, Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 
-__all__ = ["GlobalMap", "pinned_lattice", "snap_pose"]
+FloatArray = NDArray[np.float64]
+
+__all__ = ["GlobalMap", "pinned_lattice", "snap_pose", "undrawable"]
 
 
 class GlobalMap:
@@ -56,6 +60,39 @@ class GlobalMap:
         owners, sets = self._mosaic.contributor_sets()
         named = tuple(tuple(sorted(SubmapId(*i) for i in keys)) for keys in sets)  # type: ignore[misc]
         return MapProvenance(self._mosaic.spec_of(window), contradictions, owners, named)
+
+
+def undrawable(
+    lattice: GridSpec,
+    submaps: Mapping[SubmapId, StoredSubmap],
+    T_map_submap: Mapping[SubmapId, SE2],
+) -> dict[SubmapId, str]:
+    """Which submaps are not drawn, and why: with them the map would be larger than can be made.
+
+    Those near the origin, where the frame is pinned, come first.
+    """
+    found: dict[SubmapId, str] = {}
+    drawn: list[FloatArray] = []
+    order = sorted(T_map_submap, key=lambda i: (math.hypot(*T_map_submap[i].as_array()[:2]), i))
+    for submap_id in order:
+        spec, motion = submaps[submap_id].submap.grid.spec, T_map_submap[submap_id]
+        box = lattice_box(lattice, spec, motion)
+        rows, cols = np.diff(box, axis=0)[0].tolist()
+        both = joint_box([*drawn, box])
+        if rows * cols > MAX_MAP_CELLS:
+            found[submap_id] = (
+                f"not drawn: its {spec.num_rows} x {spec.num_cols} cells of {spec.resolution_m:g} "
+                f"m are {rows * cols:.2g} of the global map's {lattice.resolution_m:g} m"
+            )
+        elif np.diff(both, axis=0).max() > MAX_MAP_SIDE:
+            found[submap_id] = (
+                f"not drawn: it lies {math.hypot(motion.x, motion.y):.0f} m from where the frame "
+                f"is pinned, and a map has at most {MAX_MAP_SIDE} cells a side "
+                f"({MAX_MAP_SIDE * lattice.resolution_m:.0f} m)"
+            )
+        else:
+            drawn = [both]
+    return found
 
 
 def pinned_lattice(spec: GridSpec, resolution_m: float) -> GridSpec:

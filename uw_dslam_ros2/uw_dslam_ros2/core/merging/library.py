@@ -12,13 +12,21 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging.answers import Query
 from uw_dslam_ros2.core.merging.components import Component, Constraint, solve_components
-from uw_dslam_ros2.core.merging.config import INLIER_PROBABILITY, LOG_ODDS_MAX, NUM_NEIGHBOURS
+from uw_dslam_ros2.core.merging.config import (
+    INLIER_PROBABILITY,
+    LOG_ODDS_MAX,
+    MAX_MAP_CELLS,
+    MAX_MAP_SIDE,
+    NUM_NEIGHBOURS,
+)
 from uw_dslam_ros2.core.merging.consistency import Side
-from uw_dslam_ros2.core.merging.descriptors import MapShape, shape_of
+from uw_dslam_ros2.core.merging.descriptors import NO_SHAPE, MapShape, shape_of
 from uw_dslam_ros2.core.merging.odometry import Odometry
 from uw_dslam_ros2.core.merging.submap_groups import (
     StoredSubmap,
     SubmapGroup,
+    joint_box,
+    lattice_box,
     render_group,
     shared_area_m2,
 )
@@ -162,6 +170,25 @@ class Library:
         """Whether all submaps of a question are still in use."""
         return all(i in self.active for i in (*query.source.ids, *query.target.ids))
 
+    def why_too_large(self, group: SubmapGroup) -> str:
+        """Why a group cannot be made one map; empty if it can."""
+        return self._remember(("size", group.key), lambda: self._why_too_large(group))
+
+    def _why_too_large(self, group: SubmapGroup) -> str:
+        lattice = self.submaps[group.reference].submap.grid.spec
+        boxes = [
+            lattice_box(lattice, self.submaps[i].submap.grid.spec, T)
+            for i, T in group.T_reference_submap.items()
+        ]
+        rows, cols = np.diff(joint_box(boxes), axis=0)[0].tolist()
+        if max(rows, cols) <= MAX_MAP_SIDE and rows * cols <= MAX_MAP_CELLS:
+            return ""
+        return (
+            f"not matched: the map of {len(boxes)} submaps has {rows:.0f} x {cols:.0f} cells of "
+            f"{lattice.resolution_m:g} m, at most {MAX_MAP_SIDE} a side and {MAX_MAP_CELLS:.0e} "
+            "in all are"
+        )
+
     def render(self, group: SubmapGroup) -> OccupancyMap:
         """The group's map; not remembered, for its size."""
         occupancy = render_group(group, self.submaps, LOG_ODDS_MAX)
@@ -170,13 +197,15 @@ class Library:
 
     def shape(self, group: SubmapGroup) -> MapShape:
         """Descriptor of the group's map."""
+        if self.why_too_large(group):
+            return NO_SHAPE
         return self._remember(("shape", group.key), lambda: shape_of(self.render(group)))
 
     def rough_shape(self, track: Track) -> MapShape:
         """Descriptor of a track's map, as it was at its last milestone."""
         ids = self.closed(track)[: milestone(len(self.closed(track)))]
         key = ("rough", tuple((i, self.active[i].digest) for i in ids))
-        return self._remember(key, lambda: shape_of(self.render(self._odometry_group(ids))))
+        return self._remember(key, lambda: self.shape(self._odometry_group(ids)))
 
     def shared_area_m2(self, source: SubmapId, target: SubmapId, T_target_source: SE2) -> float:
         """Area that two submaps have both seen."""

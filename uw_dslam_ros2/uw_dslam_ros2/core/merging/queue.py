@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +13,15 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.answers import Answer, Query, QueryKey
-from uw_dslam_ros2.core.merging.components import LoopError, loop_errors
+from uw_dslam_ros2.core.merging.components import Component, LoopError, loop_errors
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MapQueueConfig
-from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
+from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice, undrawable
 from uw_dslam_ros2.core.merging.growing import make_growing_plan
 from uw_dslam_ros2.core.merging.library import Library, Memory
 from uw_dslam_ros2.core.merging.pairwise import make_pairwise_plan
 from uw_dslam_ros2.core.merging.plan import Plan, make_plan
 from uw_dslam_ros2.core.merging.records import constraints_of, records_of
+from uw_dslam_ros2.core.merging.soundness import contradicting_track, implausible_submaps
 from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import (
@@ -35,16 +37,20 @@ from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["MapQueue"]
 
+_MAX_REVISION_LEAP = 10_000
+"""A vehicle that settles its graph after each submap for hours does not come so far."""
+
 
 class MapQueue:
     """Collects the submaps of all vehicles and says which maps to register next.
 
     Sans-IO: the caller carries the requests to registration servers and brings back the results,
-    in any order and at any time. The global frame "map" is the frame of the first submap that
-    came in (or of the first one of ``config.anchor_vehicle``); that submap's cells are the lattice
-    of the global map. Where the first vehicle stays alone while others are joined, the frame goes
-    over to the largest group as soon as no question is left. Once vehicles are joined in it, it
-    never moves.
+    in any order and at any time. The global frame "map" is that of a vehicle's first submap, whose
+    cells are the lattice of the global map: of ``config.anchor_vehicle``, else of the vehicle
+    whose name comes first; among several groups of joined vehicles, of the largest group. So it
+    does not depend on the order of arrival. It moves only while no vehicles are joined in it.
+
+    What cannot be right is set aside, see `soundness`.
     """
 
     def __init__(self, config: MapQueueConfig | None = None) -> None:
@@ -52,7 +58,12 @@ class MapQueue:
         self._submaps: dict[SubmapId, StoredSubmap] = {}
         self._withdrawn: set[SubmapId] = set()
         self._anchor: SubmapId | None = None
-        self._is_pinned = False  # for good: named by the settings, or vehicles are joined in it
+        self._is_pinned = False  # for good: vehicles are joined in it
+        self._aside: dict[SubmapId, str] = {}
+        self._implausible: dict[SubmapId, str] = {}
+        self._contradicting: list[Track] = []
+        self._notices: list[str] = []
+        self._undrawn: tuple[Plan | None, dict[SubmapId, str]] = (None, {})
         self._tracks: list[Track] = []
         self._answers: dict[QueryKey, Answer] = {}
         self._standing: frozenset[QueryKey] = frozenset()
@@ -90,13 +101,15 @@ class MapQueue:
                     "differs from the one received before: are there two vehicles of this name?"
                 )
             return False
+        leap = submap.revision - (0 if held is None else held.submap.revision)
+        if leap > _MAX_REVISION_LEAP:
+            raise InvalidInputError(
+                f"submap {submap.submap_id} leaps to revision {submap.revision}, expected at most "
+                f"{_MAX_REVISION_LEAP} more than were received before"
+            )
         self._submaps[submap.submap_id] = stored
         if submap.submap_id.track not in self._tracks:
             self._tracks.append(submap.submap_id.track)
-        wanted = self._config.anchor_vehicle
-        if self._anchor is None and wanted in ("", submap.vehicle_id):
-            self._pin(submap.submap_id)
-            self._is_pinned = bool(wanted)
         self._change()
         return True
 
@@ -192,7 +205,22 @@ class MapQueue:
     def submaps(self) -> list[SubmapRecord]:
         """All submaps, by vehicle, run and sequence."""
         answers = list(self._answers.values())
-        return records_of(self._submaps, self._withdrawn, self._plan(), self._anchor, answers)
+        plan = self._plan()
+        return records_of(
+            self._submaps,
+            self._withdrawn,
+            plan,
+            self._anchor,
+            answers,
+            self._aside,
+            self._undrawable(),
+        )
+
+    def take_notices(self) -> list[str]:
+        """What a person should know of, since the last call: frames that moved."""
+        self._plan()
+        notices, self._notices = self._notices, []
+        return notices
 
     def missing(self, max_per_track: int = 100) -> dict[Track, list[int]]:
         """Sequence numbers of each run that never came, though later ones did; the first few."""
@@ -313,15 +341,16 @@ class MapQueue:
         return queue
 
     def _merged(self) -> dict[SubmapId, SE2]:
-        return self._plan().components[0] if self._anchor is not None else {}
+        components = self._plan().components
+        return components[0] if components and self._anchor in components[0] else {}
 
     def _current_library(self) -> Library:
         if self._library is None:
-            self._library = Library(
-                self._submaps,
-                frozenset(self._withdrawn),
-                self._memory,
+            self._implausible = implausible_submaps(
+                self._submaps, self._config.max_speed_m_s, self._memory
             )
+            kept = {i: s for i, s in self._submaps.items() if i not in self._implausible}
+            self._library = Library(kept, frozenset(self._withdrawn), self._memory)
         return self._library
 
     def _change(self) -> None:
@@ -333,40 +362,104 @@ class MapQueue:
         if self._plan_cache is None:
             if not self._submaps:
                 return Plan([], [], [], [])
-            anchor = self._anchor or min(self._submaps)
             library = self._current_library()
-            if self._config.mode == "pairwise":
-                plan = make_pairwise_plan(
-                    library,
-                    self._tracks,
-                    self._answers,
-                    anchor,
-                    is_growing=self._is_growing,
-                )
-            else:
-                make = make_growing_plan if self._is_growing else make_plan
-                plan = make(library, self._answers, self._standing, anchor, self._config)
+            if self._anchor is None or self._anchor not in library.submaps:
+                self._move_frame(library, ())
+            plan = self._sound_plan(library)
             self._standing = frozenset(
                 constraint.key for constraint in plan.constraints if constraint.is_inlier
             )
             self._plan_cache = plan
-            if self._pin_for_good(plan):
+            if self._settle_frame(plan):
                 self._plan_cache = None
                 return self._plan()
         return self._plan_cache
 
-    def _pin_for_good(self, plan: Plan) -> bool:
-        """Pin the frame where vehicles are joined, once nothing is open; True if that moves it."""
-        if self._is_pinned or self._is_growing or plan.wanted or self._in_flight:
-            return False
+    def _sound_plan(self, library: Library) -> Plan:
+        """A plan without the runs that others agree better without."""
+        plan = self._plan_with(library)
+        if not self._is_growing and not plan.wanted:
+            self._contradicting = []
+            whole, sound = plan, library
+            while len(self._contradicting) < len(self._tracks) and not plan.wanted:
+                track = contradicting_track(sound, plan.constraints, min(sound.submaps))
+                if track is None:
+                    break
+                self._contradicting.append(track)
+                sound = self._without(library, self._contradicting)
+                plan = self._plan_with(sound)
+            plan = dataclasses.replace(plan, wanted=[*whole.wanted, *plan.wanted])
+        elif held := [track for track in self._contradicting if track in self._tracks]:
+            # While questions are open, what was judged before goes on to hold.
+            wanted = plan.wanted
+            plan = self._plan_with(self._without(library, held))
+            known = {query.key for query in wanted}
+            wanted += [query for query in plan.wanted if query.key not in known]
+            plan = dataclasses.replace(plan, wanted=wanted)
+        self._aside = self._implausible | {
+            i: _CONTRADICTS for i in library.submaps if i.track in self._contradicting
+        }
+        return plan
+
+    def _without(self, library: Library, tracks: Sequence[Track]) -> Library:
+        kept = {i: s for i, s in library.submaps.items() if i.track not in tracks}
+        return Library(kept, frozenset(self._withdrawn), self._memory)
+
+    def _plan_with(self, library: Library) -> Plan:
+        anchor = self._anchor if self._anchor in library.submaps else min(library.submaps)
+        assert anchor is not None
+        if self._config.mode == "pairwise":
+            tracks = [
+                track for track in self._tracks if any(i.track == track for i in library.submaps)
+            ]
+            return make_pairwise_plan(
+                library, tracks, self._answers, anchor, is_growing=self._is_growing
+            )
+        make = make_growing_plan if self._is_growing else make_plan
+        return make(library, self._answers, self._standing, anchor, self._config)
+
+    def _settle_frame(self, plan: Plan) -> bool:
+        """Have the frame where the class says; True if that moves it."""
+        placed = {i for part in plan.components for i in part}
         joined = [part for part in plan.components if len({i.track for i in part}) > 1]
-        if not joined:
+        is_open = self._is_growing or bool(plan.wanted) or bool(self._in_flight)
+        if self._anchor in placed:
+            if self._is_pinned or any(self._anchor in part for part in joined):
+                self._is_pinned |= not is_open
+                return False
+            if joined and is_open:
+                return False  # what is joined now may come apart
+        return self._move_frame(self._current_library(), joined)
+
+    def _move_frame(self, library: Library, joined: Sequence[Component]) -> bool:
+        """Pin the frame to the first submap of the run that has to hold it; True if it moves."""
+        starts: dict[Track, SubmapId] = {}
+        for submap_id in sorted(i for i in library.submaps if i not in self._aside):
+            starts.setdefault(submap_id.track, submap_id)
+        by_name = sorted(
+            starts, key=lambda t: (t.vehicle_id, self._submaps[starts[t]].submap.stamp_ns, t)
+        )
+        wanted = self._config.anchor_vehicle
+        if wanted:
+            by_name = [track for track in by_name if track.vehicle_id == wanted]
+        elif joined:
+            rank = {track: index for index, track in enumerate(by_name)}
+
+            def worth(part: Component) -> tuple[int, int, int]:
+                tracks = {i.track for i in part}
+                return len(tracks), len(part), -min(rank[track] for track in tracks)
+
+            largest = {i.track for i in max(joined, key=worth)}
+            by_name = [track for track in by_name if track in largest]
+        if not by_name or starts[by_name[0]] == self._anchor:
             return False
-        self._is_pinned = True
-        if any(self._anchor in part for part in joined):
-            return False
-        largest = max(joined, key=lambda part: (len({i.track for i in part}), len(part)))
-        self._pin(min(largest, key=lambda i: (self._tracks.index(i.track), i.sequence)))
+        if self._anchor is not None:
+            self._notices.append(
+                f"the global frame is now that of {starts[by_name[0]]}; it was that of "
+                f"{self._anchor}, whose group goes on in a frame of its own"
+            )
+        self._is_pinned = False
+        self._pin(starts[by_name[0]])
         return True
 
     def _pin(self, submap_id: SubmapId) -> None:
@@ -393,6 +486,17 @@ class MapQueue:
             query.target.reference,
         )
 
+    def _undrawable(self) -> dict[SubmapId, str]:
+        merged = self._merged()
+        if self._lattice is None:
+            return {}
+        if self._undrawn[0] is not self._plan_cache:
+            self._undrawn = (
+                self._plan_cache,
+                undrawable(self._lattice, self._submaps, merged),
+            )
+        return self._undrawn[1]
+
     def _drawn(self) -> GlobalMap | None:
         """The global map, up to date: draws only what is new or has moved."""
         merged = self._merged()  # may move the frame, hence first
@@ -401,10 +505,14 @@ class MapQueue:
         if self._global_map is None:
             self._global_map = GlobalMap(self._lattice, LOG_ODDS_MAX)
         if not self._is_drawn:
-            shown = {i: T for i, T in merged.items() if i not in self._withdrawn}
+            left_out = self._withdrawn | self._undrawable().keys()
+            shown = {i: T for i, T in merged.items() if i not in left_out}
             self._global_map.draw(self._submaps, shown)
             self._is_drawn = True
         return self._global_map
+
+
+_CONTRADICTS = "set aside with its whole run, which contradicts the others' maps"
 
 
 def _moved(motion: SE2, poses: NDArray[np.float64]) -> NDArray[np.float64]:

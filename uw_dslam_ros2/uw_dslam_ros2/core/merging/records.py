@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
 from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.components import Component
 from uw_dslam_ros2.core.merging.plan import Plan, component_numbers
 from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import (
@@ -26,18 +28,30 @@ def records_of(
     plan: Plan,
     anchor: SubmapId | None,
     answers: Sequence[Answer],
+    aside: Mapping[SubmapId, str],
+    undrawn: Mapping[SubmapId, str],
 ) -> list[SubmapRecord]:
-    """All submaps, by vehicle, run and sequence."""
-    first = 0 if anchor is not None else 1
-    number = component_numbers(plan.components)
+    """All submaps, by vehicle, run and sequence.
+
+    `aside` and `undrawn` are those that are set aside, and those that are not in the map although
+    they are joined, with the reasons.
+    """
+    is_pinned = bool(plan.components) and anchor in plan.components[0]
+    components = [*plan.components, *_groups_aside(submaps, aside)]
+    first = 0 if is_pinned else 1
+    number = component_numbers(components)
     tries = _num_tries(answers)
     records = []
     for submap_id in sorted(submaps):
         component = first + number[submap_id]
         if submap_id in withdrawn:
             state, reason = SubmapState.WITHDRAWN, "taken out by a person"
+        elif submap_id in aside:
+            state, reason = SubmapState.SET_ASIDE, aside[submap_id]
         elif component == 0:
             state, reason = SubmapState.MERGED, _merge_reason(submap_id, anchor, plan)
+            if submap_id in undrawn:
+                reason = f"{reason}; {undrawn[submap_id]}"
         else:
             state, reason = SubmapState.WAITING, _wait_reason(submap_id.track, answers)
         records.append(
@@ -45,12 +59,24 @@ def records_of(
                 submaps[submap_id].submap,
                 state,
                 component,
-                plan.components[number[submap_id]][submap_id],
+                components[number[submap_id]][submap_id],
                 tries.get(submap_id.track, 0),
                 reason,
             )
         )
     return records
+
+
+def _groups_aside(
+    submaps: Mapping[SubmapId, StoredSubmap], aside: Iterable[SubmapId]
+) -> list[Component]:
+    """What is set aside, each run in the frame of its first submap, by its odometry."""
+    groups: list[Component] = []
+    for _, ids in itertools.groupby(sorted(aside), key=lambda submap_id: submap_id.track):
+        poses = {i: submaps[i].submap.T_odom_submap for i in ids}
+        T_first_odom = next(iter(poses.values())).inverse()
+        groups.append({i: T_first_odom @ T_odom_submap for i, T_odom_submap in poses.items()})
+    return groups
 
 
 def constraints_of(plan: Plan) -> list[Constraint]:

@@ -19,11 +19,20 @@ from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap, SubmapId
 
-__all__ = ["StoredSubmap", "SubmapGroup", "render_group", "shared_area_m2"]
+__all__ = [
+    "StoredSubmap",
+    "SubmapGroup",
+    "joint_box",
+    "lattice_box",
+    "render_group",
+    "shared_area_m2",
+]
 
 FloatArray = NDArray[np.float64]
 
 _MAX_FOOTPRINT_POINTS = 400
+_MAX_ODOM_M = 1e7
+"""No odometry frame of a vehicle is larger; the coordinates of a map projection fit in."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +126,19 @@ def render_group(
     return fuse_maps(lattice, placed, log_odds_max)
 
 
+def lattice_box(lattice: GridSpec, spec: GridSpec, T_frame_submap: SE2) -> FloatArray:
+    """Least and largest row and column (2, 2) of a lattice that a placed grid reaches."""
+    T_lattice_grid = lattice.T_frame_grid.inverse() @ T_frame_submap @ spec.T_frame_grid
+    corners = T_lattice_grid.apply(GridSpec(spec.resolution_m, *spec.shape).corners())
+    cells: FloatArray = corners[:, ::-1] / lattice.resolution_m
+    return np.array([cells.min(axis=0), cells.max(axis=0)])
+
+
+def joint_box(boxes: Sequence[FloatArray]) -> FloatArray:
+    """Box (2, 2) around boxes."""
+    return np.array([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
+
+
 def shared_area_m2(source: StoredSubmap, target: StoredSubmap, T_target_source: SE2) -> float:
     """Area [m^2] that both submaps have seen."""
     if len(source.footprint) == 0 or len(target.footprint) == 0:
@@ -161,6 +183,12 @@ def _check(submap: Submap, max_cells: int) -> None:
     lowest = float(np.linalg.eigvalsh(covariance)[0])
     if lowest < -1e-9 * max(1.0, float(np.abs(covariance).max())):
         raise InvalidInputError(f"{name}: covariance has eigenvalue {lowest:g}, expected >= 0")
+    away_m = max(abs(submap.T_odom_submap.x), abs(submap.T_odom_submap.y))
+    if not away_m <= _MAX_ODOM_M:
+        raise InvalidInputError(
+            f"{name}: its pose lies {away_m:g} m from odom's origin, expected at most "
+            f"{_MAX_ODOM_M:g} m"
+        )
     if submap.grid.values.size > max_cells:
         raise InvalidInputError(
             f"{name}: the grid has {submap.grid.values.size} cells, expected at most {max_cells}"

@@ -36,6 +36,7 @@ class SubmapState(enum.IntEnum):
     WAITING = 1
     MERGED = 2
     WITHDRAWN = 3
+    SET_ASIDE = 4
 
 
 class ConstraintKind(enum.IntEnum):

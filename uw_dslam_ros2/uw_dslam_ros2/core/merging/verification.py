@@ -24,7 +24,7 @@ from uw_dslam_ros2.core.merging.places import (
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.merging.voting import ENOUGH_ODDS, Vote, vote_of, weigh
 from uw_dslam_ros2.core.pose_graph import invert_covariance
-from uw_dslam_ros2.core.registration.result import PriorWindow
+from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track
 
@@ -151,10 +151,18 @@ class Verifier:
         if answer is not None:
             return answer
         self.visited.add(query.key)
-        answer = self._book.find(query)
+        answer = self._book.find(query) or self._refusal(query)
         if answer is None:
             self.wanted.setdefault(query.key, query)
         return answer
+
+    def _refusal(self, query: Query) -> Answer | None:
+        """The answer to what cannot be asked."""
+        for group in (query.source, query.target):
+            if why := self._library.why_too_large(group):
+                refused = RegistrationResult.refused(Verdict.BUDGET_EXHAUSTED, why)
+                return Answer.of(query, refused)
+        return None
 
     def _checks(
         self,

@@ -10,7 +10,13 @@ from builtin_interfaces.msg import Duration as DurationMsg
 from builtin_interfaces.msg import Time as TimeMsg
 from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
-from uw_dslam_msgs.msg import AnsweredRegistration, Registration, SubmapInfo, SubmapPose
+from uw_dslam_msgs.msg import (
+    AnsweredRegistration,
+    MergeGroup,
+    Registration,
+    SubmapInfo,
+    SubmapPose,
+)
 from uw_dslam_msgs.msg import Constraint as ConstraintMsg
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -25,7 +31,7 @@ from uw_dslam_ros2.core.merging.types import (
 )
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.core.submap import Submap, SubmapId, track_name
 from uw_dslam_ros2.ros.convert.core_types import (
     covariance_to_list,
     transform2d_from_msg,
@@ -38,6 +44,8 @@ __all__ = [
     "constraint_from_msg",
     "constraint_to_msg",
     "graph_to_markers",
+    "group_frame_id",
+    "groups_to_msgs",
     "record_from_msg",
     "record_to_msg",
 ]
@@ -213,6 +221,29 @@ def _group_from_msg(poses: Sequence[SubmapPose], reference: int, name: str) -> S
     # Equal groups have equal keys; what the queue's own key is, the message does not say.
     key = repr([(str(i), T) for i, T in members.items()]).encode()
     return SubmapGroup(list(members)[reference], members, key)
+
+
+def group_frame_id(component: int, records: Sequence[SubmapRecord], map_frame: str) -> str:
+    """Frame of a group: the map's own, or one that is named after its first vehicle and run."""
+    if component == 0:
+        return map_frame
+    return f"{map_frame}_{track_name(records[0].submap.submap_id.track)}"
+
+
+def groups_to_msgs(records: Sequence[SubmapRecord], map_frame: str) -> list[MergeGroup]:
+    """Which submaps share a frame, by component."""
+    members: dict[int, list[SubmapRecord]] = {}
+    for record in records:
+        members.setdefault(record.component, []).append(record)
+    return [
+        MergeGroup(
+            component=component,
+            frame_id=group_frame_id(component, own, map_frame),
+            vehicle_ids=sorted({record.submap.vehicle_id for record in own}),
+            num_submaps=len(own),
+        )
+        for component, own in sorted(members.items())
+    ]
 
 
 def constraint_to_msg(constraint: Constraint) -> ConstraintMsg:

@@ -29,6 +29,7 @@ from uw_dslam_ros2.core.merging import (
     MapQueueConfig,
     MatchRequest,
     StartPoses,
+    SubmapRecord,
     SubmapState,
 )
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
@@ -43,6 +44,8 @@ from uw_dslam_ros2.ros.convert.core_types import (
 from uw_dslam_ros2.ros.convert.merging import (
     constraint_to_msg,
     graph_to_markers,
+    group_frame_id,
+    groups_to_msgs,
     record_to_msg,
 )
 from uw_dslam_ros2.ros.convert.registration import options_to_msg, registration_from_msg
@@ -104,9 +107,10 @@ class MapQueueManager(Node):
         self._map = MapPublisher(self, self._config.map_frame, self._config.full_map_period_s)
         self._status_pub = self.create_publisher(MergeStatus, "merge_status", LATCHED)
         self._graph_pub = self.create_publisher(MarkerArray, "pose_graph", LATCHED)
-        self._broadcaster = FrameBroadcaster(self)
+        self._broadcaster = FrameBroadcaster(self) if self._config.publishes_tf else None
         self._group = ReentrantCallbackGroup()
         self._topics: set[str] = set()
+        self._owners: dict[str, str] = {}
         self._worker = Worker("map queue", self._on_worker_error)
         self._servers = RegistrationClients(
             self,
@@ -187,6 +191,15 @@ class MapQueueManager(Node):
     # --- in the worker's thread: submaps and registrations -----------------------------------
 
     def _add_submap(self, topic: str, submap: Submap) -> None:
+        # Nobody takes a name from its owner, unless that one is gone.
+        owner = self._owners.setdefault(submap.vehicle_id, topic)
+        if owner != topic and self.count_publishers(owner):
+            self.complain(
+                f"submap refused on {topic}: {submap.vehicle_id} is heard on {owner}; are there "
+                "two vehicles of this name?"
+            )
+            return
+        self._owners[submap.vehicle_id] = topic
         try:
             is_new = self._queue.add_submap(submap)
         except InvalidInputError as error:
@@ -231,6 +244,9 @@ class MapQueueManager(Node):
         if not self._idle.is_active(now_s):
             self._maps.rest()
         self._queue.is_growing = self._idle.is_active(now_s)
+        for notice in self._queue.take_notices():
+            self._message = notice
+            self.get_logger().warning(notice)
         self._ask()
         # First saved, then told: what anybody has heard of outlives a kill.
         self._keeper.save_if_due(self._queue)
@@ -332,7 +348,9 @@ class MapQueueManager(Node):
             constraints=[constraint_to_msg(constraint) for constraint in constraints],
             num_waiting=states[SubmapState.WAITING],
             num_merged=states[SubmapState.MERGED],
+            num_set_aside=states[SubmapState.SET_ASIDE],
             num_components=len({record.component for record in records}),
+            groups=groups_to_msgs(records, self._config.map_frame),
             num_registrations=self._queue.num_registrations,
             num_in_flight=len(self._asked),
             num_servers=self._servers.num_ready,
@@ -368,26 +386,45 @@ class MapQueueManager(Node):
         }
 
     def _publish_transforms(self) -> None:
-        """Map -> <vehicle>/map of the merged ones: when the clock moves, or a new reader comes."""
+        """Each group's frame -> <vehicle>/map: when the clock moves, or a new reader comes.
+
+        A vehicle that leaves the global map gets another parent, which ends its old transform.
+        """
+        if self._broadcaster is None:
+            return
         stamp_ns = self._now()
-        vehicle_ids = sorted({record.submap.vehicle_id for record in self._queue.submaps()})
-        places: list[tuple[str, SE2]] = []
-        for vehicle_id in vehicle_ids:
-            T_map_odom = self._queue.T_map_odom(vehicle_id)
-            if T_map_odom is not None:
-                places.append((vehicle_id, T_map_odom))
+        places = self._places()
         state = (stamp_ns, tuple(places), self._broadcaster.num_readers)
         if not places or stamp_ns == 0 or state == self._sent_transforms:
             return
         self._sent_transforms = state
         stamp = self.get_clock().now().to_msg()
-        frame_id = self._config.map_frame
         self._broadcaster.send(
             *(
                 transform_to_msg(stamp, frame_id, self._maps.frame_of(name, frame_id), T)
-                for name, T in places
+                for frame_id, name, T in places
             )
         )
+
+    def _places(self) -> list[tuple[str, str, SE2]]:
+        """Of each vehicle's newest run: frame of its group, vehicle, place of its map there."""
+        groups: dict[int, list[SubmapRecord]] = {}
+        newest: dict[str, SubmapRecord] = {}
+        for record in self._queue.submaps():
+            submap = record.submap
+            groups.setdefault(record.component, []).append(record)
+            is_newest_run = submap.run_id == self._queue.newest_run(submap.vehicle_id)
+            if is_newest_run and record.state is not SubmapState.SET_ASIDE:
+                newest[submap.vehicle_id] = record
+        map_frame = self._config.map_frame
+        return [
+            (
+                group_frame_id(record.component, groups[record.component], map_frame),
+                vehicle_id,
+                record.T_component_submap @ record.submap.T_odom_submap.inverse(),
+            )
+            for vehicle_id, record in sorted(newest.items())
+        ]
 
     # --- what the services ask for -----------------------------------------------------------
 
