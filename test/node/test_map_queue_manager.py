@@ -35,7 +35,11 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.provenance import read_provenance
 from uw_dslam_ros2.io.session import SessionInUseError, has_session, load_session
-from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, submap_to_msg
+from uw_dslam_ros2.ros.convert.core_types import (
+    occupancy_from_msg,
+    submap_from_msg,
+    submap_to_msg,
+)
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
 from uw_dslam_ros2.ros.plumbing import missing_submaps
@@ -66,11 +70,11 @@ class Probe:
         for transform in msg.transforms:
             self.transforms[transform.header.frame_id, transform.child_frame_id] = transform
 
-    def send(self, submap):
+    def send(self, submap, **options):
         topic = f"/{submap.vehicle_id}/submap"
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(SubmapMsg, topic, SUBMAPS)
-        self._publishers[topic].publish(submap_to_msg(submap))
+        self._publishers[topic].publish(submap_to_msg(submap, **options))
 
     @property
     def num_merged(self):
@@ -252,6 +256,38 @@ def test_same_submap_again_changes_nothing(manage):
         probe.send(room_submap("auv_3"))  # the queue has seen the repeat when it has seen this
         until(lambda: ("auv_3", 0) in probe.states(), "the next submap")
         assert call(ListSubmaps, "list_submaps", vehicle_id="auv_1").submaps == before
+
+
+def test_a_message_that_only_moves_a_submap_keeps_its_grid(manage):
+    first, _ = two_submaps()
+    moved = dataclasses.replace(first, revision=1, T_odom_submap=SE2(3.0, 1.0, 0.5))
+    with manage(has_server=False, **FAST) as (until, probe, call):
+        probe.send(first)
+        until(lambda: probe.num_merged == 1, "the submap")
+        assert len(submap_to_msg(moved, is_pose_only=True).grid.data) == 0
+        probe.send(moved, is_pose_only=True)
+        until(lambda: probe.statuses[-1].submaps[0].revision == 1, "the move")
+        got = call(GetSubmap, "get_submap", vehicle_id="auv_1", sequence=0).submap
+    submap = submap_from_msg(got)
+    assert max(submap.T_odom_submap.distance_to(moved.T_odom_submap)) < 1e-9
+    np.testing.assert_array_equal(submap.grid.values, first.grid.values)
+    assert len(submap.trajectory) == len(first.trajectory)
+
+
+def test_who_lacks_a_submap_that_moved_asks_for_it(manage, ros_context):
+    first, _ = two_submaps()
+    moved = dataclasses.replace(first, revision=1)
+    mapper = rclpy.create_node("sonar_mapper", context=ros_context, namespace="auv_1")
+    publisher = mapper.create_publisher(SubmapMsg, "submap", SUBMAPS)
+
+    def give(_, response):
+        response.result, response.submap = response.DONE, submap_to_msg(moved)
+        return response
+
+    mapper.create_service(GetSubmap, "~/get_submap", give)
+    with manage(mapper, has_server=False, **FAST) as (until, probe, _):
+        publisher.publish(submap_to_msg(moved, is_pose_only=True))
+        until(lambda: probe.num_merged == 1, "the submap that was asked for")
 
 
 def test_bad_submap_is_refused_and_the_manager_lives(manage):

@@ -65,6 +65,7 @@ class MapQueue:
         self._notices: list[str] = []
         self._undrawn: tuple[Plan | None, dict[SubmapId, str]] = (None, {})
         self._tracks: list[Track] = []
+        self._lacking: set[SubmapId] = set()
         self._answers: dict[QueryKey, Answer] = {}
         self._standing: frozenset[QueryKey] = frozenset()
         self._memory: Memory = {}
@@ -108,6 +109,7 @@ class MapQueue:
                 f"{_MAX_REVISION_LEAP} more than were received before"
             )
         self._submaps[submap.submap_id] = stored
+        self._lacking.discard(submap.submap_id)
         if submap.submap_id.track not in self._tracks:
             self._tracks.append(submap.submap_id.track)
         self._change()
@@ -223,8 +225,12 @@ class MapQueue:
         return notices
 
     def missing(self, max_per_track: int = 100) -> dict[Track, list[int]]:
-        """Sequence numbers of each run that never came, though later ones did; the first few."""
+        """Sequence numbers of each run that never came, though they were heard of; the first few.
+
+        That is: later ones came, or somebody spoke of them, see `note_missing`.
+        """
         held: dict[Track, list[int]] = {}
+        lacking = [i for i in self._lacking if i not in self._submaps]
         for submap_id in sorted(self._submaps):
             held.setdefault(submap_id.track, []).append(submap_id.sequence)
         found: dict[Track, list[int]] = {}
@@ -236,7 +242,20 @@ class MapQueue:
             )
             if first := list(itertools.islice(gaps, max_per_track)):
                 found[track] = first
+        for submap_id in lacking:
+            numbers = found.setdefault(submap_id.track, [])
+            if submap_id.sequence not in numbers and len(numbers) < max_per_track:
+                numbers.append(submap_id.sequence)
         return found
+
+    def note_missing(self, submap_id: SubmapId) -> None:
+        """There is such a submap, and it did not come."""
+        self._lacking.add(submap_id)
+
+    def submap(self, submap_id: SubmapId) -> Submap | None:
+        """A submap as it was last received; None if it never came."""
+        held = self._submaps.get(submap_id)
+        return None if held is None else held.submap
 
     def answers(self) -> list[tuple[Answer, bool]]:
         """All answers, by target and source, and whether each holds in the pose graph."""

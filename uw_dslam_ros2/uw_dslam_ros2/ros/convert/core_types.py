@@ -10,6 +10,7 @@ types unless told to, so every number that goes into a message passes ``float()`
 from __future__ import annotations
 
 import array
+import dataclasses
 import math
 
 import numpy as np
@@ -40,6 +41,7 @@ __all__ = [
     "stamp_ns_from_msg",
     "stamp_to_msg",
     "submap_from_msg",
+    "submap_id_of",
     "submap_to_msg",
     "transform2d_from_msg",
     "transform2d_to_msg",
@@ -293,8 +295,8 @@ def submap_frame_id(submap_id: SubmapId) -> str:
     return f"{submap_id.vehicle_id}/submap_{submap_id.sequence}"
 
 
-def submap_to_msg(submap: Submap) -> SubmapMsg:
-    """Message of a submap."""
+def submap_to_msg(submap: Submap, *, is_pose_only: bool = False) -> SubmapMsg:
+    """Message of a submap; of its pose only, where all else was sent with an earlier revision."""
     frame_id = submap_frame_id(submap.submap_id)
     msg = SubmapMsg()
     msg.header.frame_id = frame_id
@@ -304,7 +306,10 @@ def submap_to_msg(submap: Submap) -> SubmapMsg:
     msg.sequence = int(submap.sequence)
     msg.revision = int(submap.revision)
     msg.is_final = bool(submap.is_final)
+    msg.is_pose_only = is_pose_only
     msg.pose = pose_with_covariance_to_msg(submap.T_odom_submap, submap.covariance)
+    if is_pose_only:
+        return msg
     msg.grid = occupancy_to_msg(submap.grid, frame_id, submap.stamp_ns)
     msg.points = [Point32(x=float(x), y=float(y)) for x, y in submap.points]
     msg.trajectory = [
@@ -314,13 +319,32 @@ def submap_to_msg(submap: Submap) -> SubmapMsg:
     return msg
 
 
-def submap_from_msg(msg: SubmapMsg) -> Submap:
-    """Submap of a message; raises `InvalidInputError` naming the field that is wrong."""
+def submap_id_of(msg: SubmapMsg) -> SubmapId:
+    """Which submap a message is about."""
+    return SubmapId(msg.vehicle_id, int(msg.run_id), int(msg.sequence))
+
+
+def submap_from_msg(msg: SubmapMsg, held: Submap | None = None) -> Submap:
+    """Submap of a message; raises `InvalidInputError` naming the field that is wrong.
+
+    `held` is the submap as it was last received: a message that only moves it says no more.
+    """
     if not msg.vehicle_id or msg.vehicle_id != msg.vehicle_id.strip("/"):
         raise InvalidInputError(
             f"submap.vehicle_id is {msg.vehicle_id!r}, expected a name without slashes at its ends"
         )
     name = f"submap {msg.vehicle_id}/{msg.sequence}"
+    if msg.is_pose_only:
+        if held is None or held.submap_id != submap_id_of(msg):
+            raise InvalidInputError(f"{name}: only its pose came, expected the submap before")
+        return dataclasses.replace(
+            held,
+            revision=int(msg.revision),
+            is_final=bool(msg.is_final),
+            stamp_ns=stamp_ns_from_msg(msg.header.stamp),
+            T_odom_submap=pose_from_msg(msg.pose.pose, f"{name}.pose.pose"),
+            covariance=covariance_from_pose_msg(msg.pose, f"{name}.pose"),
+        )
     points = np.array([(p.x, p.y) for p in msg.points], dtype=np.float64).reshape(-1, 2)
     if not np.isfinite(points).all():
         raise InvalidInputError(f"{name}.points hold a number that is not finite, expected metres")

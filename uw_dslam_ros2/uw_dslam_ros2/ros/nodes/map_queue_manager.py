@@ -40,6 +40,7 @@ from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_to_msg,
     submap_frame_id,
     submap_from_msg,
+    submap_id_of,
 )
 from uw_dslam_ros2.ros.convert.merging import (
     constraint_to_msg,
@@ -166,6 +167,9 @@ class MapQueueManager(Node):
 
     def _on_submap(self, topic: str, msg: SubmapMsg) -> None:
         self._counts["num_submap_messages"] += 1
+        if msg.is_pose_only:
+            self._worker.post(lambda: self._move_submap(topic, msg))
+            return
         try:
             submap = submap_from_msg(msg)
         except InvalidInputError as error:
@@ -190,6 +194,21 @@ class MapQueueManager(Node):
 
     # --- in the worker's thread: submaps and registrations -----------------------------------
 
+    def _move_submap(self, topic: str, msg: SubmapMsg) -> None:
+        """Take a message that only moves a submap; who lacks the submap asks for it."""
+        submap_id = submap_id_of(msg)
+        held = self._queue.submap(submap_id)
+        if held is None:
+            self._queue.note_missing(submap_id)
+            self._missing.note(topic, submap_id)
+            return
+        try:
+            submap = submap_from_msg(msg, held)
+        except InvalidInputError as error:
+            self.complain(f"bad submap on {topic}: {error}")
+            return
+        self._add_submap(topic, submap)
+
     def _add_submap(self, topic: str, submap: Submap) -> None:
         # Nobody takes a name from its owner, unless that one is gone.
         owner = self._owners.setdefault(submap.vehicle_id, topic)
@@ -205,7 +224,7 @@ class MapQueueManager(Node):
         except InvalidInputError as error:
             self.complain(f"submap refused on {topic}: {error}")
             return
-        self._missing.note(topic, submap)
+        self._missing.note(topic, submap.submap_id)
         if not is_new:
             self._counts["num_repeated"] += 1
             return

@@ -26,7 +26,7 @@ from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
 from uw_dslam_ros2.core.mapping import RunBreak, VehicleMapper, VehicleMapperConfig, VehicleRuns
 from uw_dslam_ros2.core.pose_graph import compose_covariance
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
+from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap, SubmapId
 from uw_dslam_ros2.io.conventions import correct, correct_mounting
 from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed_runs
@@ -90,6 +90,7 @@ class SonarMapper(Node):
         self._odom_frame = self._config.odom_frame or f"{self._vehicle_id}/odom"
         self._T_odom_base = self._T_odom_run = SE2()
         self._smooth_mapper: VehicleMapper | None = None
+        self._sent: set[SubmapId] = set()
         self._runs = VehicleRuns(self._mapper_config, self._vehicle_id, _draw_run_id)
         self._order: StampOrder[SensorEvent] = StampOrder(
             int(self._reorder_s() * 1e9),
@@ -402,7 +403,11 @@ class SonarMapper(Node):
     def _publish_submaps(self, submaps: Iterable[Submap]) -> None:
         for submap in submaps:
             self._counts["num_submap_messages"] += 1
-            self._submap_pub.publish(submap_to_msg(submap))
+            # What is closed moves, and changes no more: a grid is a megabyte.
+            is_known = submap.submap_id in self._sent
+            self._counts["num_pose_messages"] += is_known
+            self._submap_pub.publish(submap_to_msg(submap, is_pose_only=is_known))
+            self._sent.add(submap.submap_id)
 
     def _publish_odometry(self, stamp_ns: int) -> None:
         self._odom_stamp_ns = stamp_ns

@@ -14,7 +14,7 @@ from rclpy.task import Future
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_msgs.srv import GetSubmap
 
-from uw_dslam_ros2.core.submap import Submap, SubmapId, Track, track_name
+from uw_dslam_ros2.core.submap import SubmapId, Track, track_name
 from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 
 __all__ = ["MissingSubmaps"]
@@ -66,9 +66,9 @@ class MissingSubmaps:
         self.lost = ""
         """What is missing and cannot be had; empty: nothing."""
 
-    def note(self, topic: str, submap: Submap) -> None:
+    def note(self, topic: str, submap_id: SubmapId) -> None:
         """Remember on which topic a run's submaps come: its sender is asked for others."""
-        self._topics[submap.submap_id.track] = topic
+        self._topics[submap_id.track] = topic
 
     def look(self, missing: Mapping[Track, Sequence[int]]) -> None:
         """Ask for what is missing now."""
