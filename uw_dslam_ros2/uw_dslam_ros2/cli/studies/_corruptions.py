@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -23,6 +24,7 @@ Change = Callable[[Reading, float], Reading]
 
 _IMAGE_TYPE = "marine_acoustic_msgs/msg/ProjectedSonarImage"
 _LOST_S = (40.0, 70.0)
+_SLOW_S = 0.8
 _FULL_SCALE = 255.0
 
 
@@ -97,6 +99,21 @@ def _without_lock(_: Tell) -> Change:
         if isinstance(reading, VelocityEvent) and _LOST_S[0] < elapsed_s < _LOST_S[1]:
             return replace(reading, velocity_m_s=np.zeros(3))
         return reading
+
+    return change
+
+
+def _slow_heading(_: Tell) -> Change:
+    """An orientation from behind a filter, beside rates that are in time."""
+    waiting: deque[tuple[float, FloatArray]] = deque()
+
+    def change(reading: Reading, elapsed_s: float) -> Reading:
+        if not isinstance(reading, ImuEvent) or reading.orientation_xyzw is None:
+            return reading
+        waiting.append((elapsed_s, reading.orientation_xyzw))
+        while len(waiting) > 1 and waiting[1][0] <= elapsed_s - _SLOW_S:
+            waiting.popleft()
+        return replace(reading, orientation_xyzw=waiting[0][1])
 
     return change
 
@@ -177,6 +194,9 @@ CORRUPTIONS: dict[str, Corruption] = {
         ("imu_no_orientation",),
         _imu(lambda _: np.array([0.0, 0.0, 0.0, 1.0])),
         {"imu_orientation": "none"},
+    ),
+    "heading 0.8 s behind the rates": Corruption(
+        ("heading_delay",), _slow_heading, {"imu_rates": "none", "imu_delay_s": _SLOW_S}
     ),
     "dvl's sign": Corruption(
         ("dvl_sign",), _velocity(-np.eye(2)), {"velocity_yaw_offset_rad": math.pi}
