@@ -5,7 +5,14 @@ from glob import glob
 from setuptools import find_packages, setup
 
 NAME = "uw_dslam_ros2"
-NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
+NODES = (
+    "sonar_mapper",
+    "registration_server",
+    "map_queue_manager",
+    "bag_player",
+    "acoustic_link",
+    "channel",
+)
 COMMANDS = (
     "simulate",
     "offline",

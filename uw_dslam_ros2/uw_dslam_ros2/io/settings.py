@@ -79,7 +79,14 @@ REMOVED = {
 }
 """Settings of earlier versions, and what became of them."""
 
-NODES = ("sonar_mapper", "registration_server", "map_queue_manager", "bag_player")
+NODES = (
+    "sonar_mapper",
+    "registration_server",
+    "map_queue_manager",
+    "bag_player",
+    "acoustic_link",
+    "channel",
+)
 _SENSOR_SETTINGS = {field.name for field in fields(SensorConfig)}
 _EVERY_NODE = "/**"
 _PARAMETERS = "ros__parameters"

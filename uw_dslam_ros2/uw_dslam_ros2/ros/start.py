@@ -7,12 +7,29 @@ import os
 import signal
 from typing import Any
 
-__all__ = ["bag_player", "map_queue_manager", "registration_server", "sonar_mapper"]
+__all__ = [
+    "acoustic_link",
+    "bag_player",
+    "channel",
+    "map_queue_manager",
+    "registration_server",
+    "sonar_mapper",
+]
+
+
+def acoustic_link() -> int:
+    """See `nodes.acoustic_link`."""
+    return _run("acoustic_link")
 
 
 def bag_player() -> int:
     """See `nodes.bag_player`."""
     return _run("bag_player")
+
+
+def channel() -> int:
+    """See `nodes.channel`."""
+    return _run("channel")
 
 
 def map_queue_manager() -> int:

@@ -32,7 +32,8 @@ from uw_dslam_ros2.core.submap import Submap
 __all__ = ["AcousticLink"]
 
 _OUTLINE_RANK, _CELLS_RANK, _ANSWER_RANK, _MOVED_RANK, _DETAIL_RANK = 0.0, 1.0, 1.5, 1.8, 2.0
-_NEWS_PER_STATUS = 10  # fragments after which the others are told what has come
+_PACKETS_PER_STATUS = 12  # between two reports while there is something else to send
+_HASTE = 0.3  # who has nothing else to say reports that much sooner
 _MAX_ASKS = 4
 
 
@@ -66,7 +67,7 @@ class AcousticLink:
         self._answers: list[bytes] = []
         self._heard_s: dict[int, float] = {}
         self._news, self._last_status_s, self._num_reports = 0, -1e9, 0
-        self._was_status = self._is_curious = False
+        self._num_since_status, self._is_curious = _PACKETS_PER_STATUS, False
         self._outbox.add(hello_item(name), _OUTLINE_RANK, "hello")
 
     # --- own submaps -------------------------------------------------------------------------
@@ -173,7 +174,7 @@ class AcousticLink:
                 label = "status"
             elif len(notes) == 1 and item is not None:
                 label = item.label
-        self._was_status = label == "status"
+        self._num_since_status = 0 if label == "status" else self._num_since_status + 1
         self.counts.repairs = self._outbox.num_repairs
         counts = self.counts
         counts.sent_packets[label] = counts.sent_packets.get(label, 0) + 1
@@ -205,16 +206,15 @@ class AcousticLink:
 
     def _is_status_due(self, now_s: float, is_idle: bool) -> bool:
         since_s, wait_s = now_s - self._last_status_s, self._config.status_s
-        if self._was_status and not is_idle:
-            return False  # where turns are rare they are not spent on reports alone
-        if self._is_curious or (
-            self._news and (self._news >= _NEWS_PER_STATUS or since_s >= wait_s)
-        ):
+        if not is_idle:
+            # Turns that items wait for are not spent on reports alone.
+            is_time = self._num_since_status >= _PACKETS_PER_STATUS
+            return is_time and (self._is_curious or self._news > 0 or not self.is_complete)
+        if self._is_curious or (self._news and since_s >= _HASTE * wait_s):
             return True
-        # A report, or a question, may have been lost.
-        if (self._asks or not self.is_complete) and since_s >= 3.0 * wait_s:
-            return True
-        return is_idle and since_s >= self._config.heartbeat_s
+        # A report, a question or the last of what was sent may have been lost.
+        is_open = self._asks or not self.is_complete or self._outbox.is_unheard(self._peers(now_s))
+        return since_s >= (2.0 * wait_s if is_open else self._config.heartbeat_s)
 
     @property
     def _room(self) -> int:
@@ -289,6 +289,7 @@ class AcousticLink:
             self._take_found(sender, inbox, inbox.add_whole(said))
         elif isinstance(said, Status):
             inbox.expect(said.num_items, said.voids)
+            self._news += not inbox.is_complete  # tell what is lacking
             report = said.peers.get(self._config.number)
             if report is None and said.is_cut:
                 return

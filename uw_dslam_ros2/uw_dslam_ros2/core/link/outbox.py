@@ -85,6 +85,15 @@ class Outbox:
         for item in self.items:
             item.peers.pop(peer, None)
 
+    def is_unheard(self, peers: Iterable[int]) -> bool:
+        """Whether some peer has not confirmed all that was sent."""
+        known = list(peers)
+        return any(
+            item.num_sent > 0 and not item.is_void and item.peers.get(peer, (1, 0))[0] > 0
+            for item in self.items
+            for peer in known
+        )
+
     def voids(self, peers: Iterable[int]) -> tuple[int, ...]:
         """Items that somebody still lacks and need not get."""
         known = list(peers)

@@ -15,17 +15,16 @@ class LinkConfig(Config):
     """How a vehicle speaks."""
 
     number: int = setting(
-        1, 0, MAX_SENDERS - 1, "the vehicle's number on the link; no two share one", is_basic=True
+        1, 0, MAX_SENDERS - 1, "the vehicle's number on the link; no two share one"
     )
     packet_bytes: int = setting(
         64,
         MIN_PACKET_BYTES,
         MAX_PACKET_BYTES,
         "largest packet of the modem [bytes]",
-        is_basic=True,
     )
     key: str = setting(
-        "", doc="secret of the fleet: packets that were made without it are refused", is_basic=True
+        "", doc="secret of the fleet: packets that were made without it are refused"
     )
     status_s: float = setting(
         10.0,

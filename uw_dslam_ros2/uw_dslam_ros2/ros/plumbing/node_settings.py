@@ -10,7 +10,9 @@ from uw_dslam_ros2.io.sensor_settings import SensorConfig
 
 __all__ = [
     "NODE_CONFIGS",
+    "AcousticLinkConfig",
     "BagPlayerConfig",
+    "ChannelNodeConfig",
     "MapQueueManagerConfig",
     "RegistrationServerConfig",
     "SonarMapperConfig",
@@ -167,12 +169,51 @@ class ViewConfig(Config):
     token: str = setting("", doc="what a browser must know; empty: drawn where one is needed")
 
 
+@dataclass(frozen=True, slots=True)
+class AcousticLinkConfig(Config):
+    """Settings of an acoustic link as a node; `link` holds those of the link itself."""
+
+    vehicle_id: str = setting("", doc="the vehicle's name; empty: the node's namespace")
+    state: str = setting(
+        "",
+        doc="file that outlives a restart with all that was received; empty: none",
+    )
+    is_detail_asked: bool = setting(
+        True,
+        doc="ask for cells of 0.1 m of submaps by which the manager has joined vehicles",
+    )
+    time_scale: float = setting(
+        1.0, 0.01, 1000.0, "seconds that pass in a second: as that of the simulated channel"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelNodeConfig(Config):
+    """Settings of the simulated water as a node; `channel` holds those of the water itself."""
+
+    vehicles: tuple[str, ...] = setting(
+        (),
+        doc="namespaces of the vehicles whose modems it joins, in the order of turns",
+    )
+    domains: tuple[str, ...] = setting(
+        (), doc="ROS domain of each vehicle; empty: all in the node's own"
+    )
+    preset: str = setting(
+        "",
+        doc="a documented modem: nano, rate0 or psk5; empty: by the settings of channel",
+    )
+    spacing_m: float = setting(60.0, 0.0, 1e5, "between one vehicle and the next [m]")
+    time_scale: float = setting(1.0, 0.01, 1000.0, "seconds that pass in a second")
+
+
 NODE_CONFIGS: dict[str, type[Config]] = {
     "sonar_mapper": SonarMapperConfig,
     "registration_server": RegistrationServerConfig,
     "map_queue_manager": MapQueueManagerConfig,
     "bag_player": BagPlayerConfig,
     "view": ViewConfig,
+    "acoustic_link": AcousticLinkConfig,
+    "channel": ChannelNodeConfig,
 }
 
 

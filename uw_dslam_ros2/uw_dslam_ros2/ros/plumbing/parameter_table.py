@@ -17,6 +17,8 @@ from typing import Any
 
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.link import LinkConfig
+from uw_dslam_ros2.core.link.channel import ChannelConfig
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.merging import GrowingMapConfig, MapQueueConfig
 from uw_dslam_ros2.core.registration import GridRegistrationConfig, RegistrationConfig
@@ -34,6 +36,8 @@ GROUPS: dict[str, tuple[tuple[str, type[Config]], ...]] = {
     "map_queue_manager": (("queue", MapQueueConfig), ("maps", GrowingMapConfig)),
     "bag_player": (),
     "view": (),
+    "acoustic_link": (("link", LinkConfig),),
+    "channel": (("channel", ChannelConfig),),
 }
 """Groups of parameters of each node, beside its own."""
 
@@ -50,6 +54,8 @@ def parameter_tables(*, is_basic: bool) -> str:
             items += settings_of(config_type, prefix)
         items = [item for item in items if not _is_repeated(*item)]
         rows = [_row(*item) for item in items if _is_basic(item[2]) == is_basic]
+        if not rows:
+            continue
         header = "| parameter | type | default | range | meaning |\n|---|---|---|---|---|"
         parts.append(f"### {node}\n\n{header}\n" + "\n".join(rows))
     return "\n\n".join(parts)

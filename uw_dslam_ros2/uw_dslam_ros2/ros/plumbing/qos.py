@@ -6,6 +6,7 @@ __all__ = [
     "CLOCK",
     "DEFAULT",
     "LATCHED",
+    "MODEM",
     "PLAYBACK",
     "SERVICES",
     "STATIC_TF",
@@ -33,6 +34,9 @@ CLOCK = QoSProfile(depth=10)
 
 SERVICES = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 """Requests and answers: of the usual ten, a burst loses those that come while none is taken."""
+
+MODEM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+"""Packets between a link and its modem: what is lost on the way is lost in the water."""
 
 PLAYBACK = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 """What a bag player offers: reliable, so that large images arrive; best effort matches it too."""

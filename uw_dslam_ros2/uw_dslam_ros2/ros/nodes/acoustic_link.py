@@ -1,0 +1,199 @@
+"""One vehicle's end of an acoustic link: its submaps out through a modem, the others' in."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import threading
+import time
+from typing import Any
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from std_msgs.msg import Empty, UInt8MultiArray
+from uw_dslam_msgs.msg import Constraint, MergeStatus
+from uw_dslam_msgs.msg import Submap as SubmapMsg
+
+from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
+from uw_dslam_ros2.core.link import AcousticLink, Layer, LayerKey, LinkConfig
+from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.io.link_state import load_link_state, save_link_state
+from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_to_msg
+from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.plumbing.node_settings import AcousticLinkConfig
+from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
+from uw_dslam_ros2.ros.plumbing.qos import LATCHED, MODEM, SUBMAPS
+from uw_dslam_ros2.ros.plumbing.running import run_node
+
+__all__ = ["AcousticLinkNode", "main"]
+
+_SAVE_PERIOD_S = 2.0
+
+
+class AcousticLinkNode(Node):
+    """Drives an `AcousticLink`: the modem says when a packet may go, and brings what has come."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("acoustic_link", **kwargs)
+        self._config = declare_config(self, AcousticLinkConfig)
+        link_config = declare_config(self, LinkConfig, "link")
+        refuse_unknown_parameters(self)
+        self._vehicle_id = self._config.vehicle_id or self.get_namespace().strip("/")
+        if not self._vehicle_id:
+            raise ConfigError(
+                "parameter vehicle_id is empty and the node has no namespace; "
+                "give one of them (-r __ns:=/auv_1)"
+            )
+        self._lock = threading.Lock()
+        self._outputs: dict[str, Publisher] = {}
+        self._asked: set[tuple[int, LayerKey]] = set()
+        self._is_changed, self._problem = False, ""
+        self._link = self._resumed(link_config)
+        # Callbacks are short, and the link is one thing: one after the other.
+        group = MutuallyExclusiveCallbackGroup()
+        self._modem = self.create_publisher(UInt8MultiArray, "modem/send", MODEM)
+        self.create_subscription(
+            SubmapMsg, "submap", self._on_submap, SUBMAPS, callback_group=group
+        )
+        self.create_subscription(
+            UInt8MultiArray,
+            "modem/received",
+            self._on_packet,
+            MODEM,
+            callback_group=group,
+        )
+        self.create_subscription(Empty, "modem/ready", self._on_ready, MODEM, callback_group=group)
+        if self._config.is_detail_asked:
+            self.create_subscription(
+                MergeStatus, "/merge_status", self._on_status, LATCHED, callback_group=group
+            )
+        self._give(self._link.submaps())
+        self._diagnostics = Diagnostics(self, self._report, self._vehicle_id)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_SAVE_PERIOD_S, self._save, clock=steady, callback_group=group)
+
+    def stop(self) -> None:
+        """Keep what was received."""
+        self._save()
+
+    def destroy_node(self) -> None:
+        """Save, then destroy."""
+        self.stop()
+        super().destroy_node()
+
+    def _now_s(self) -> float:
+        return time.monotonic() * self._config.time_scale
+
+    def _resumed(self, config: LinkConfig) -> AcousticLink:
+        state = load_link_state(self._config.state) if self._config.state else None
+        if state is None:
+            # The others must not take what comes now for what came before.
+            return AcousticLink(config, self._vehicle_id, secrets.randbelow(4))
+        link = AcousticLink.from_state(config, self._vehicle_id, state)
+        num_submaps = sum(1 for _ in link.submaps())
+        self.get_logger().info(f"went on with {num_submaps} submaps from {self._config.state}")
+        return link
+
+    # --- callbacks ---------------------------------------------------------------------------
+
+    def _on_submap(self, msg: SubmapMsg) -> None:
+        try:
+            with self._lock:
+                self._give(self._link.add_submap(submap_from_msg(msg)))
+        except InvalidInputError as error:
+            self._complain(str(error))
+
+    def _on_packet(self, msg: UInt8MultiArray) -> None:
+        with self._lock:
+            found = self._link.receive(bytes(msg.data), self._now_s())
+        self._is_changed = True
+        self._give(found)
+
+    def _on_ready(self, _: Empty) -> None:
+        with self._lock:
+            packet = self._link.next_packet(self._now_s())
+        if packet is not None:
+            self._modem.publish(UInt8MultiArray(data=packet))
+
+    def _on_status(self, msg: MergeStatus) -> None:
+        """Ask for the detail of submaps that hold the vehicles together."""
+        for constraint in msg.constraints:
+            if constraint.kind != Constraint.REGISTRATION or not constraint.is_inlier:
+                continue
+            self._ask(
+                constraint.source_vehicle_id, constraint.source_run_id, constraint.source_sequence
+            )
+            self._ask(
+                constraint.target_vehicle_id, constraint.target_run_id, constraint.target_sequence
+            )
+
+    def _ask(self, vehicle_id: str, run_id: int, sequence: int) -> None:
+        key = LayerKey.of(run_id, sequence, Layer.FINE)
+        with self._lock:
+            number = self._link.number_of(vehicle_id)
+            if number is None or (number, key) in self._asked:
+                return
+            self._asked.add((number, key))
+            found = self._link.ask(number, key)
+        self._give(found)
+
+    # --- out ---------------------------------------------------------------------------------
+
+    def _give(self, submaps: Any) -> None:
+        for submap in submaps:
+            self._is_changed = True
+            self._output_of(submap).publish(submap_to_msg(submap))
+
+    def _output_of(self, submap: Submap) -> Publisher:
+        name = re.sub(r"\W", "_", submap.vehicle_id, flags=re.ASCII)
+        topic = f"link/{name if name[0].isalpha() else '_' + name}/submap"
+        if topic not in self._outputs:
+            self._outputs[topic] = self.create_publisher(SubmapMsg, topic, SUBMAPS)
+        return self._outputs[topic]
+
+    def _save(self) -> None:
+        if not (self._config.state and self._is_changed):
+            return
+        with self._lock:
+            state = self._link.to_state()
+        try:
+            save_link_state(self._config.state, state)
+            self._is_changed, self._problem = False, ""
+        except DataError as error:
+            self._complain(str(error))
+
+    def _complain(self, text: str) -> None:
+        if text != self._problem:
+            self.get_logger().warning(text)
+        self._problem = text
+
+    def _report(self) -> Report:
+        now_s = self._now_s()
+        with self._lock:
+            link, counts = self._link, self._link.counts
+            values: dict[str, float | int | str] = {
+                "vehicles heard": sum(1 for n in range(32) if link.age_s(n, now_s) is not None),
+                "submaps known": sum(1 for _ in link.outlines()),
+                "items to send": link.num_open(now_s),
+                "loss": link.loss,
+                "received packets": counts.received_packets,
+                "received bytes": counts.received_bytes,
+                "duplicates": counts.duplicates,
+                "repairs": counts.repairs,
+            }
+            values |= {f"sent bytes {kind}": num for kind, num in counts.sent_bytes.items()}
+            values |= {f"sent packets {kind}": num for kind, num in counts.sent_packets.items()}
+            values |= {f"refused: {why}": num for why, num in counts.refused.items()}
+            for number in range(32):
+                if (age_s := link.age_s(number, now_s)) is not None:
+                    values[f"age of {link.name_of(number) or number} [s]"] = age_s
+        if self._problem:
+            return "warning", self._problem, values
+        return "info", f"{values['submaps known']} submaps known", values
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run_node("acoustic_link", AcousticLinkNode, argv)
