@@ -151,11 +151,11 @@ def _merged_rows(mission: FleetMission) -> tuple[list[dict[str, Any]], set[Subma
     found: list[dict[str, Any]] = []
     details: set[SubmapId] = set()
     for name, layer in _WAYS.items():
-        layers = dict.fromkeys((s.submap_id for s in mission.submaps), layer)
-        if layer is Layer.FINE:
-            layers = {i: Layer.FINE if i in details else Layer.COARSE for i in layers}
-        crossed = [(s, 0) if layer is None else _crossed(s, layers[s.submap_id])
-                   for s in mission.submaps]  # fmt: skip
+        crossed = []
+        for submap in mission.submaps:
+            is_coarse = layer is Layer.FINE and submap.submap_id not in details
+            finest = Layer.COARSE if is_coarse else layer
+            crossed.append((submap, 0) if finest is None else _crossed(submap, finest))
         sent = FleetMission(mission.name, tuple(pair[0] for pair in crossed), mission.truth)
         placing, matched = merged_largest(sent)
         if layer is Layer.COARSE:
