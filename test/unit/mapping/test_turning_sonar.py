@@ -160,3 +160,32 @@ def test_loops_see_the_walls_between_wide_beams(by_beams):
     points = by_beams[1][0].points
     spacing_m, _ = cKDTree(points).query(points, k=2)
     assert spacing_m[:, 1].max() < 0.6
+
+
+@pytest.mark.parametrize("late_ns", [0, 7 * S])
+def test_points_of_a_turn_may_come_when_it_is_over(recording, late_ns):
+    """Deskewed by somebody else to its middle; the vehicle has turned by a radian since."""
+    navigation, stamps, bearing, ranges = recording
+    events = [(t, 0, (t, yaw, speed)) for t, yaw, speed in navigation]
+    for start in range(0, len(stamps), BEAMS_PER_TURN):
+        middle = int(stamps[start + BEAMS_PER_TURN // 2])
+        T_middle_world = (pose_at(middle) @ SONAR).inverse()
+        points = []
+        for i in range(start, start + BEAMS_PER_TURN):
+            echo = (ranges[i] * math.cos(bearing[i]), ranges[i] * math.sin(bearing[i]))
+            points.append((T_middle_world @ pose_at(int(stamps[i])) @ SONAR).apply([echo])[0])
+        events.append((middle + late_ns, 1, (middle, np.array(points))))
+    mapper = VehicleMapper(CONFIG, "auv_1")
+    for t, kind, value in sorted(events, key=lambda event: event[:2]):
+        if kind == 0:
+            mapper.add_imu(t, value[1], None)
+            mapper.add_velocity(t, (value[2], 0.0))
+        else:
+            mapper.add_points(*value, SONAR)
+    mapper.finish()
+    stamped, poses = mapper.trajectory()
+    start = pose_at(int(stamped[0]))
+    T_odom_world = SE2.from_array(poses[0]) @ start.inverse()
+    truth = np.array([(T_odom_world @ pose_at(int(t))).as_array() for t in stamped])
+    assert len(poses) >= 7
+    assert np.hypot(*(poses - truth)[:, :2].T).max() < 0.4

@@ -379,7 +379,9 @@ class VehicleMapper:
             self._count("num_pings_dropped")
             return []
         if self._last_ping_ns is None:
-            self._navigation.remember(0.0 if sweep is None else _TURN_MEMORY_S)
+            # Points of a turn come when it is over, and may be stamped with its middle.
+            is_turn = sweep is not None or detections.beamwidth_rad >= WIDE_BEAM_RAD
+            self._navigation.remember(_TURN_MEMORY_S if is_turn else 0.0)
             self._suit(detections.beamwidth_rad)
         self._last_ping_ns = detections.stamp_ns
         return self._process(detections, T_base_sonar, sweep)
