@@ -34,6 +34,8 @@ _MIN_APART_S = 4.0
 """Echoes nearer in time are of one turn: that they lie side by side says nothing."""
 _STEP_S = 0.1
 _COARSE_M, _MIDDLE_M, _FINE_M = 2.0, 0.8, 0.4
+_COARSE_STEP = 5
+"""Where the kernel is wide, every fifth pair says the same."""
 _MAX_DELAY_S = 2.0
 _CLIMB = (
     (_COARSE_M, math.radians(5.0), 0.5),
@@ -168,7 +170,8 @@ class _Window:
     def score(self, reading: TurningReading, width_m: float) -> float:
         """Mean nearness of echoes that were heard at different times, 0 to 1."""
         points = self.points(reading)
-        offset = points[self._first] - points[self._second]
+        few = slice(None, None, _COARSE_STEP if width_m >= _COARSE_M else 1)
+        offset = points[self._first[few]] - points[self._second[few]]
         squares = (np.square(offset.real) + np.square(offset.imag)) / width_m**2
         return float(np.mean(1.0 / np.square(1.0 + squares)))
 
