@@ -127,6 +127,22 @@ def test_a_pose_that_moves_goes_out_without_its_cells():
     assert talk.links[1].counts.sent_bytes["coarse"] == before
 
 
+def test_a_pose_can_move_without_the_grid_at_hand():
+    talk = Talk(num=2)
+    talk.add(own_submap(1, 0))
+    talk.run(20.0)
+    state = talk.links[1].to_state()
+    link = talk.links[1] = AcousticLink.from_state(LinkConfig(number=1), "auv_1", state)
+    held = link.own_submap(own_submap(1, 0).submap_id)
+    moved = dataclasses.replace(held, revision=7, T_odom_submap=SE2(9.0, 8.0, 0.7))
+    talk._note(1, link.move_submap(moved))
+    talk.run(60.0)
+    assert content(talk.got[2][moved.submap_id]) == content(talk.got[1][moved.submap_id])
+    assert talk.got[2][moved.submap_id].T_odom_submap.x == pytest.approx(9.0)
+    with pytest.raises(InvalidInputError, match="moves before it has come"):
+        link.move_submap(own_submap(1, 5))
+
+
 def test_what_was_overtaken_need_not_arrive():
     """Outlines that were lost and replaced are not sent again."""
     talk = Talk(num=2, blackouts=[(0.0, 30.0)])

@@ -27,7 +27,15 @@ from uw_dslam_ros2.core.link.outline import Outline, shape_of_cells
 from uw_dslam_ros2.core.link.path import read_path, write_path
 from uw_dslam_ros2.core.submap import Submap
 
-__all__ = ["CODEC_VERSION", "CellLayer", "Layer", "LayeredSubmap", "encode_submap"]
+__all__ = [
+    "CODEC_VERSION",
+    "CellLayer",
+    "Layer",
+    "LayeredSubmap",
+    "encode_submap",
+    "read_outline",
+    "write_outline",
+]
 
 CODEC_VERSION = 1
 """Of layers; others are refused."""

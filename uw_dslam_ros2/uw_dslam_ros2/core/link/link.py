@@ -5,10 +5,17 @@ Sans-IO: the caller has the modem and the time. Nothing depends on what other cl
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.link.codec import Layer, LayeredSubmap, encode_submap, read_outline
+from uw_dslam_ros2.core.link.codec import (
+    Layer,
+    LayeredSubmap,
+    encode_submap,
+    read_outline,
+    write_outline,
+)
 from uw_dslam_ros2.core.link.fields import ByteReader
 from uw_dslam_ros2.core.link.inbox import Inbox
 from uw_dslam_ros2.core.link.items import (
@@ -27,7 +34,7 @@ from uw_dslam_ros2.core.link.items import (
 from uw_dslam_ros2.core.link.outbox import Outbox, OutItem
 from uw_dslam_ros2.core.link.packets import OVERHEAD_BYTES, Packet, bundled, unbundled
 from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = ["AcousticLink"]
 
@@ -83,6 +90,30 @@ class AcousticLink:
         for layer in (Layer.OUTLINE, Layer.COARSE):
             self._say(LayerKey.of(submap.run_id, submap.sequence, layer), layers[layer])
         self._rank_cells()
+        return self._improved(self._config.number)
+
+    def own_submap(self, submap_id: SubmapId) -> Submap | None:
+        """A submap of this vehicle: as it came or, after a restart, as the others have it."""
+        run = submap_id.run_id & 0xFFFF
+        source = self._sources.get((run, submap_id.sequence))
+        held = self._held.get((self._config.number, run, submap_id.sequence))
+        return source or (None if held is None else held.submap(self._name))
+
+    def move_submap(self, submap: Submap) -> list[Submap]:
+        """Take a new pose of an own submap, whose cells are as before; as `add_submap`."""
+        run = submap.run_id & 0xFFFF
+        held = self._held.get((self._config.number, run, submap.sequence))
+        if held is None or held.outline is None:
+            raise InvalidInputError(f"submap {submap.submap_id} moves before it has come")
+        outline = dataclasses.replace(
+            held.outline,
+            revision=submap.revision,
+            is_final=submap.is_final,
+            T_odom_submap=submap.T_odom_submap,
+            covariance=submap.covariance,
+        )
+        key = LayerKey.of(submap.run_id, submap.sequence, Layer.OUTLINE)
+        self._say(key, write_outline(outline, self._key))
         return self._improved(self._config.number)
 
     def ask(self, sender: int, key: LayerKey) -> list[Submap]:
