@@ -64,7 +64,7 @@ REMOVED = {
             ("min_probability", f"write 1 less it as {group}.max_false_accept"),
             ("max_conflict", "it is always 0.4"),
             ("max_rival_probability", "it is always 0.8"),
-            ("max_slide_share", "the standard deviation along a wall decides, in metres"),
+            ("max_slide_share", "the covariance says how free a direction is"),
         )
     },
     "queue.log_odds_max": "it is always 8",

@@ -108,7 +108,7 @@ def _corridor(bays: list[int], thickness: int = 2) -> OccupancyMap:
 
 
 @pytest.mark.parametrize(("bays", "least", "most"), [
-    ([], 30.0, math.inf), ([70, 160], 0.5, 30.0), ([20, 60, 110, 150, 200], 0.0, 2.0),
+    ([], 30.0, math.inf), ([50, 110, 190], 0.0, 30.0), ([20, 60, 110, 150, 200], 0.0, 2.0),
 ])  # fmt: skip
 @pytest.mark.parametrize("thickness", [1, 4])
 def test_a_corridor_is_fixed_along_as_well_as_its_bays_fix_it(bays, least, most, thickness):

@@ -48,7 +48,7 @@ def random_pose(rng):
 def random_case(rng):
     rivals = tuple(random_pose(rng) for _ in range(rng.integers(0, 4)))
     evidence = MatchEvidence(
-        random_pose(rng), rivals, rng.exponential(0.2), rng.uniform(1, 9), rng.uniform(5, 18), 0.05
+        random_pose(rng), rivals, rng.exponential(0.8), rng.uniform(1, 9), rng.uniform(5, 18), 0.05
     )
     config = GridRegistrationConfig(is_proof_required=bool(rng.random() < 0.3))
     if rng.random() < 0.5:
@@ -66,12 +66,6 @@ def random_case(rng):
 
 # What a sentence begins with, what it measures, the limit, and on which side of it it must lie.
 SENTENCES = {
-    "the walls leave one direction free": (
-        Verdict.AMBIGUOUS,
-        lambda e, _: e.deviation_m,
-        None,  # a share of the walls' extent
-        "most",
-    ),
     "share of the smaller map's": (
         Verdict.NOT_ENOUGH_OVERLAP,
         lambda e, _: e.best.agreement.overlap,
@@ -135,8 +129,7 @@ def test_each_sentence_states_the_numbers_that_decided(rng):
         assert verdict is expected
         assert said_side == side
         assert value > said_limit if side == "most" else value < said_limit
-        if limit is not None:
-            assert said_limit == pytest.approx(limit(config, probability), abs=0.0051)
+        assert said_limit == pytest.approx(limit(config, probability), abs=0.0051)
         if measured is not None:
             assert value == pytest.approx(measured(evidence, probability), abs=0.0051)
     assert set(SENTENCES) <= set(seen)
@@ -160,7 +153,6 @@ def test_what_is_accepted_breaks_no_limit_and_the_name_fits_the_cause(rng):
         num_accepted += 1
         assert agreement.overlap >= config.min_overlap
         assert agreement.conflict <= 0.4
-        assert evidence.deviation_m <= 0.15 * evidence.extent_m
         assert probability >= 1.0 - config.max_false_accept
         assert not proof.is_cancelled
         assert not config.is_proof_required or (proof.is_complete and proof.is_optimum)
@@ -220,3 +212,14 @@ def test_numbers_that_look_equal_get_more_digits():
     assert at_most(0.24, 0.2) == "24%, expected at most 20%"
     assert at_most(0.2404, 0.24) == "24.04%, expected at most 24.00%"
     assert at_least(0.7499, 0.75, ".2f") == "0.7499, expected at least 0.7500"
+
+
+def test_a_corridor_is_accepted_as_what_it_is():
+    """What the graph needs is the covariance; who reads the answer is told."""
+    config = GridRegistrationConfig()
+    loose = replace(GOOD, deviation_m=1.3)
+    verdict, reason, probability = decide(loose, config)
+    assert verdict is Verdict.ACCEPTED
+    assert "along it the standard deviation is 1.3 m" in reason
+    assert probability == decide(GOOD, config)[2]
+    assert "standard deviation" not in decide(GOOD, config)[1]

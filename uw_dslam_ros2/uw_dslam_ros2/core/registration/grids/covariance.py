@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem
+from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["PoseSpread", "curvature", "pose_spread"]
 
@@ -30,7 +31,7 @@ _LEAST_POINTS = 8  # of a square whose own displacement is looked at
 _UNSEEN_PER_CELL2 = 60.0
 _FLOOR_CELLS = 0.03
 _SHIFTS = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))  # where squares begin is arbitrary
-_FIRST_STEP_CELLS = 1.0
+_FIRST_STEP_CELLS = 4.0  # nearer, walls lie on the kernels of those that they lay on
 _STEP_FACTOR = math.sqrt(2.0)
 _SQUARE_ERROR = 0.05  # of its worth, at least: maps do not agree to the last cell
 _LEAST_ERRORS = 0.5  # a pose d away that is as good tells of s = d, not of infinity
@@ -75,9 +76,19 @@ def pose_spread(
     pulls, places = problem.point_gradients(pose)
     weights = np.concatenate([problem.source_weights, problem.target_weights])
     is_pulling = np.abs(pulls).sum(axis=1) > 0.0
-    values, vectors = np.linalg.eigh(curvature(problem, pose))
-    free = _free_deviation(problem, pose, vectors[:, 0] * scale, places, seen)
-    pulls, places, weights = pulls[is_pulling] * scale, places[is_pulling], weights[is_pulling]
+    # A direction is one of turning about the walls that pull and of moving them: these are common
+    # to both maps, so neither is the first.
+    about = _About.of(places[is_pulling], pose)
+    back = about.jacobian_of_pose()
+    hessian = (back / scale[:, None]).T @ curvature(problem, pose) @ (back / scale[:, None])
+    values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+    # Along a corridor, or round a bay.
+    straight = np.array([0.0, *np.linalg.eigh(hessian[1:, 1:])[1][:, 0]])
+    weakest = [
+        (direction, _free_deviation(problem, pose, about, direction, places, seen))
+        for direction in (straight, vectors[:, 0])
+    ]
+    pulls, places, weights = pulls[is_pulling] @ back, places[is_pulling], weights[is_pulling]
     # Directions that the maps do not fix at all get the size of the map, not infinity.
     floor = max(float(values.max()), 1e-9) * 1e-5
     inverse = vectors @ np.diag(1.0 / np.maximum(values, floor)) @ vectors.T
@@ -85,21 +96,61 @@ def pose_spread(
     covariance = inverse @ _scatter(pulls, places) @ inverse
     covariance *= 1.0 + _UNSEEN_PER_CELL2 * strain
     covariance += _FLOOR_CELLS**2 * np.eye(3)
-    weakest = vectors[:, 0]
-    known = float(weakest @ covariance @ weakest)
-    covariance += max(free**2 - known, 0.0) * np.outer(weakest, weakest)
+    for direction, free in weakest:
+        known = float(direction @ covariance @ direction)
+        covariance += max(free**2 - known, 0.0) * np.outer(direction, direction)
     deviation = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
-    return PoseSpread(np.diag(scale) @ covariance @ np.diag(scale), deviation)
+    return PoseSpread(back @ covariance @ back.T, deviation)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _About:
+    """Small motions about the middle of the places where two maps pull at each other.
+
+    One is [turn at the rim, x, y] in target cells; ``arm`` (2,) goes from there to where the
+    source's centre lies, ``rim`` is the root mean square distance of the places.
+    """
+
+    middle: FloatArray
+    rim: float
+    arm: FloatArray
+
+    @staticmethod
+    def of(places: FloatArray, pose: FloatArray) -> _About:
+        """About places (N, 2), at a pose (3,)."""
+        middle = places.mean(axis=0) if len(places) else pose[1:]
+        spread = float(((places - middle) ** 2).sum(axis=1).mean()) if len(places) else 1.0
+        return _About(middle, max(math.sqrt(spread), 1.0), pose[1:] - middle)
+
+    def jacobian_of_pose(self) -> FloatArray:
+        """Derivative (3, 3) of [theta, t_x, t_y] by a motion."""
+        jacobian = np.eye(3)
+        jacobian[:, 0] = np.array([1.0, -self.arm[1], self.arm[0]]) / self.rim
+        return jacobian
+
+    def moved(self, pose: FloatArray, motion: FloatArray) -> FloatArray:
+        """The pose after a motion at constant twist, the same way back as forth."""
+        turn = float(motion[0]) / self.rim
+        half = 0.5 * turn
+        chord = math.sin(half) / half if abs(half) > 1e-9 else 1.0
+        shift = SE2(yaw=half).rotation() @ motion[1:] * chord
+        arm = SE2(yaw=turn).rotation() @ self.arm
+        return np.array([pose[0] + turn, *(self.middle + arm + shift)])
 
 
 def _free_deviation(
-    problem: GridProblem, pose: FloatArray, direction: FloatArray, places: FloatArray, seen: Seen
+    problem: GridProblem,
+    pose: FloatArray,
+    about: _About,
+    direction: FloatArray,
+    places: FloatArray,
+    seen: Seen,
 ) -> float:
     """Standard deviation [cells] in a direction, from how far off the maps exclude a pose.
 
     The curvature at a maximum says nothing of poses farther off, which along a corridor are nearly
     as good. Of a normal distribution, a pose d away is d / (2 s) standard errors less likely; so s
-    is the greatest d / (2 z) up to where z excludes the pose. A wall that only leaves what the
+    is the greatest d / (2 z) short of where z excludes the pose. A wall that only leaves what the
     other map has seen says nothing against it. The error of the loss is that of the squares' sums,
     and as if one more square erred by their mean: few squares may all err.
     """
@@ -110,19 +161,18 @@ def _free_deviation(
         squares.append((index, _SQUARE_ERROR**2 * float((np.bincount(index, weights) ** 2).sum())))
     here = problem.point_values(pose)
     found, step = 0.0, _FIRST_STEP_CELLS
-    while step < 2.0 * problem.radius:
+    while step < 2.0 * about.rim:
         errors = math.inf
         for sign in (1.0, -1.0):
-            moved = pose + sign * step * direction
-            lost = np.where(
-                _is_seen(problem, moved, seen), here - problem.point_values(moved), 0.0
-            )
+            moved = about.moved(pose, sign * step * direction)
+            there = problem.point_values(moved)
+            lost = np.where(_is_seen(problem, moved, seen), here - there, 0.0)
             errors = min(errors, _standard_errors(lost, squares))
-        found = max(found, 0.5 * step / max(errors, _LEAST_ERRORS))
         if errors >= _EXCLUDED_ERRORS:
             return found
+        found = max(found, 0.5 * step / max(errors, _LEAST_ERRORS))
         step *= _STEP_FACTOR
-    return max(found, problem.radius)
+    return max(found, about.rim)
 
 
 def _is_seen(problem: GridProblem, pose: FloatArray, seen: Seen) -> NDArray[np.bool_]:

@@ -26,7 +26,7 @@ _IMPROBABLE_CONFLICT = 0.24  # where a match is not probable either, that is why
 MOST_RIVAL_PROBABILITY = 0.8
 """A rival that by itself is more probable than that makes a match ambiguous."""
 _LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
-_MOST_DEVIATION = 0.15  # of a pose in its weakest direction, share of the walls' extent
+_LOOSE_SHARE = 0.1  # of the walls' extent: less sure along its weakest direction is worth saying
 _DOUBTED = 0.5  # most probability left to a pose that the maps do not tell from others
 
 
@@ -69,11 +69,6 @@ class _Case:
         self.least = 1.0 - config.max_false_accept
         self.is_probable = self.probability >= self.least
         self.max_conflict = _MOST_CONFLICT if self.is_probable else _IMPROBABLE_CONFLICT
-
-    @property
-    def most_deviation_m(self) -> float:
-        """More is no pose, not even of a corridor."""
-        return _MOST_DEVIATION * self.evidence.extent_m
 
     @property
     def alone(self) -> float:
@@ -143,15 +138,6 @@ _RULES: tuple[Rule[_Case, Verdict], ...] = (
         lambda c: c.not_finite != "",
         Verdict.TOO_FEW_FEATURES,
         lambda c: f"the maps hold too little to judge their best alignment by: {c.not_finite}",
-    ),
-    Rule(
-        lambda c: c.evidence.deviation_m > c.most_deviation_m,
-        Verdict.AMBIGUOUS,
-        lambda c: (
-            "the walls leave one direction free, as a straight wall does: standard deviation "
-            f"in metres {at_most(c.evidence.deviation_m, c.most_deviation_m, '.2f')}"
-        ),
-        most_probability=_DOUBTED,
     ),
     Rule(
         lambda c: c.agreement.overlap < c.config.min_overlap,
@@ -234,6 +220,11 @@ def decide(
     rule = first_that_applies(_RULES, case)
     reason = rule.sentence(case)
     if rule.outcome is Verdict.ACCEPTED:
+        if evidence.deviation_m > _LOOSE_SHARE * evidence.extent_m:
+            reason += (
+                "; the walls leave one direction free, as those of a corridor do: along it the "
+                f"standard deviation is {evidence.deviation_m:.2g} m"
+            )
         if not case.proof.is_optimum:
             reason += f"; {case.higher}, but the maps speak for this one"
         if not case.proof.is_complete:
