@@ -55,6 +55,16 @@ def test_a_long_silence_begins_a_new_run(role):
     assert runs.diagnostics()["num_runs"] == 2
 
 
+def test_submaps_of_earlier_runs_can_be_had_again():
+    runs, submaps = drive(EVENTS, lost("yaw", 15, 36))
+    for submap_id, submap in submaps.items():
+        again = runs.issued(submap_id.run_id, submap_id.sequence)
+        assert again.submap_id == submap_id
+        np.testing.assert_array_equal(again.grid.values, submap.grid.values)
+    assert runs.issued(0, 0).run_id == 2
+    assert runs.issued(1, 99) is runs.issued(7, 0) is None
+
+
 def test_no_ping_is_drawn_where_the_heading_is_guessed():
     """Each run by itself is as good as one without a silence: it knows nothing of it."""
     runs, submaps = drive(EVENTS, lost("yaw", 15, 36))

@@ -84,6 +84,7 @@ class VehicleRuns:
         self._heard: dict[str, _Stream] = {}
         self._speed_m_s = 0.0
         self._before: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+        self._earlier: dict[int, VehicleMapper] = {}
         self._counts: list[dict[str, float | int | str]] = []
 
     def note_heading(self, stamp_ns: int) -> list[Submap]:
@@ -115,9 +116,17 @@ class VehicleRuns:
         issued = self.mapper.finish()
         self._before.append(self.trajectory_of_run())
         self._counts.append(self.mapper.diagnostics())
+        self._earlier[self.mapper.run_id] = self.mapper
         self.breaks.append(reason)
         self.mapper = self._new_mapper()
         return issued
+
+    def issued(self, run_id: int, sequence: int) -> Submap | None:
+        """A submap of any run as it was given away last; 0: of the run that goes on."""
+        if run_id in (0, self.mapper.run_id):
+            return self.mapper.issued(sequence)
+        earlier = self._earlier.get(run_id)
+        return None if earlier is None else earlier.issued(sequence)
 
     def finish(self) -> list[Submap]:
         """End the last run; no ping may follow."""

@@ -227,6 +227,11 @@ class VehicleMapper:
         return self._navigation.is_started
 
     @property
+    def run_id(self) -> int:
+        """Which run of its vehicle this is, see `core.submap.Track`."""
+        return self._run_id
+
+    @property
     def num_pings(self) -> int:
         """Pings mapped so far."""
         return int(self._counts["num_pings"])

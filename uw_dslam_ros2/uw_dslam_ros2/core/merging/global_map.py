@@ -71,6 +71,8 @@ def undrawable(
 
     Those near the origin, where the frame is pinned, come first.
     """
+    if _surely_fits(lattice, submaps, T_map_submap):
+        return {}
     found: dict[SubmapId, str] = {}
     drawn: list[FloatArray] = []
     order = sorted(T_map_submap, key=lambda i: (math.hypot(*T_map_submap[i].as_array()[:2]), i))
@@ -93,6 +95,28 @@ def undrawable(
         else:
             drawn = [both]
     return found
+
+
+def _surely_fits(
+    lattice: GridSpec,
+    submaps: Mapping[SubmapId, StoredSubmap],
+    T_map_submap: Mapping[SubmapId, SE2],
+) -> bool:
+    """Whether circles around all grids lie in a map that can be made: the usual case, quickly."""
+    x, y, reach = [], [], []
+    for submap_id, motion in T_map_submap.items():
+        spec = submaps[submap_id].submap.grid.spec
+        origin = spec.T_frame_grid
+        x.append(motion.x)
+        y.append(motion.y)
+        reach.append(math.hypot(origin.x, origin.y) + spec.resolution_m * math.hypot(*spec.shape))
+    if not reach:
+        return True
+    side_m = max(float(np.ptp(x)), float(np.ptp(y))) + 2.0 * max(reach)
+    cells = 2.0 * max(reach) / lattice.resolution_m
+    return side_m / lattice.resolution_m <= MAX_MAP_SIDE / math.sqrt(2.0) and (
+        2.0 * cells**2 <= MAX_MAP_CELLS
+    )
 
 
 def pinned_lattice(spec: GridSpec, resolution_m: float) -> GridSpec:

@@ -81,10 +81,12 @@ def contradicting_track(
         return None
     blame: dict[Track, int] = {}
     for track in sorted({track for constraint in outliers for track in _ends(constraint)}):
-        others = [constraint for constraint in constraints if track not in _ends(constraint)]
-        solved, _ = library.solve(anchor, others)
         own = [constraint for constraint in constraints if track in _ends(constraint)]
         held = _num_inliers(own)
+        if len(outliers) < max(_MIN_BROKEN, held + 1):
+            continue  # even if all of them were its fault
+        others = [constraint for constraint in constraints if track not in _ends(constraint)]
+        solved, _ = library.solve(anchor, others)
         broken = len(own) - held + _num_inliers(solved) - _num_inliers(others)
         if broken >= _MIN_BROKEN and broken > held:
             blame[track] = broken - held

@@ -481,11 +481,9 @@ class SonarMapper(Node):
         return response
 
     def _issued(self, request: GetSubmap.Request) -> Submap | None:
-        found = self._mapper.issued(int(request.sequence))
-        is_wanted = found is not None and (
-            request.vehicle_id == found.vehicle_id and request.run_id in (0, found.run_id)
-        )
-        return found if is_wanted else None
+        if request.vehicle_id != self._vehicle_id:
+            return None
+        return self._runs.issued(int(request.run_id), int(request.sequence))
 
     def _report(self) -> Report:
         for sensor in list(self._inputs.values()):
