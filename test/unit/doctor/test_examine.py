@@ -132,6 +132,13 @@ def test_without_a_dvl_the_imu_and_the_sonar_are_late_alike(recording):
     assert finding.confidence == 0.5
 
 
+def test_a_late_imu_with_a_later_heading_is_mended_by_both(recording):
+    found = examine(*late(imu_s=0.5)(*imu(filtered)(*recording)))
+    assert [finding.kind for finding in found.findings] == ["heading_delay", "imu_delay"]
+    assert found.conventions.imu_rates == "none"
+    assert found.conventions.imu_delay_s == pytest.approx(1.3, abs=0.05)
+
+
 def test_pixels_of_power_are_told_unless_they_are_read_so(recording):
     navigation, pings = recording
     found = examine(navigation, replace(pings, pixels="power"))

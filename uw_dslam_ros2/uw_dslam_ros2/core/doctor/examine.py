@@ -347,14 +347,16 @@ class _Trial:
     def _say_delays(self, delays: Delays) -> None:
         either = "" if delays.is_owner_known else "; or it is the {}, which the dvl does not tell"
         if delays.imu_s:
+            # An orientation that is late by itself is put in time with the rates first.
+            total_s = self._result.conventions.imu_delay_s + delays.imu_s
             self._add(
                 "imu_delay",
                 "imu",
                 f"its stamps are {_late(delays.imu_s)} than those of sonar and dvl, by how the "
                 f"echoes turn{either.format('sonar')} (conventions.imu_delay_s: "
-                f"{delays.imu_s:.2f})",
+                f"{total_s:.2f})",
                 delays.confidence,
-                imu_delay_s=round(delays.imu_s, 3),
+                imu_delay_s=round(total_s, 3),
             )
         if delays.sonar_s:
             self._add(
