@@ -215,3 +215,14 @@ def test_a_blurred_wall_is_thicker_and_less_certain():
 def test_a_map_of_nothing_has_no_sharpness():
     assert math.isnan(map_sharpness(occupancy([[-1, -1]])).entropy_bits)
     assert map_sharpness(occupancy([[0, 0]])).wall_share == 0.0
+
+
+@pytest.mark.parametrize("num_rows", [7, 256, 257, 600])
+def test_a_large_map_is_compared_in_strips_as_if_at_once(rng, num_rows):
+    spec = GridSpec(0.1, num_rows, 40, SE2(1.0, -2.0, 0.3))
+    one, other = (rng.integers(-1, 101, spec.shape).astype(np.int8) for _ in range(2))
+    found = compare_maps(OccupancyMap(spec, one), OccupancyMap(spec, other))
+    pictures = [np.where(values < 0, 0.5, values / 100.0) for values in (one, other)]
+    assert found.mse == pytest.approx(np.mean((pictures[0] - pictures[1]) ** 2), rel=1e-12)
+    expected = structural_similarity(*pictures, win_size=7, data_range=1.0)
+    assert found.ssim == pytest.approx(expected, abs=1e-9)

@@ -6,6 +6,7 @@ vehicles. `trajectory_error` finds it from the trajectories; maps are compared u
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,6 +39,7 @@ BoolArray = NDArray[np.bool_]
 Trajectory = tuple[IntArray, FloatArray]
 """Stamps (K,) [ns], rising, and poses (K, 3) [x, y, yaw] in metres and radians."""
 
+_STRIP_ROWS = 256
 _SSIM_WINDOW = 7
 
 
@@ -189,12 +191,20 @@ def resample(
     steps_row, steps_col = (np.arange(count) + 0.5 for count in spec.shape)
     cos, sin = ratio * math.cos(T_grids.yaw), ratio * math.sin(T_grids.yaw)
     x_0, y_0 = T_grids.x / own.resolution_m, T_grids.y / own.resolution_m
-    cols = np.floor((x_0 + cos * steps_col)[None] - (sin * steps_row)[:, None]).astype(np.int32)
-    rows = np.floor((y_0 + sin * steps_col)[None] + (cos * steps_row)[:, None]).astype(np.int32)
-    is_inside = (rows >= 0) & (rows < own.shape[0]) & (cols >= 0) & (cols < own.shape[1])
     values = np.full(spec.shape, -1, dtype=np.int8)
-    values[is_inside] = occupancy.values[rows[is_inside], cols[is_inside]]
+    for strip in _strips(spec.num_rows):
+        steps = steps_row[strip, None]
+        cols = np.floor((x_0 + cos * steps_col)[None] - sin * steps).astype(np.int32)
+        rows = np.floor((y_0 + sin * steps_col)[None] + cos * steps).astype(np.int32)
+        is_inside = (rows >= 0) & (rows < own.shape[0]) & (cols >= 0) & (cols < own.shape[1])
+        values[strip][is_inside] = occupancy.values[rows[is_inside], cols[is_inside]]
     return values
+
+
+def _strips(num_rows: int) -> list[slice]:
+    """Rows in parts of about the same height: as floats, a whole map would take much room."""
+    edges = np.linspace(0, num_rows, 1 + -(-num_rows // _STRIP_ROWS)).astype(int).tolist()
+    return [slice(first, last) for first, last in itertools.pairwise(edges)]
 
 
 def compare_maps(
@@ -254,18 +264,15 @@ def compare_maps(
     counts = np.ones(spec.shape, dtype=np.bool_) if region is None else region
     if not counts.any():
         raise InvalidInputError("region holds no cell, expected at least one")
-    picture, true_picture = _picture(found), _picture(true)
-    _, similarity = structural_similarity(
-        picture, true_picture, win_size=_SSIM_WINDOW, data_range=1.0, full=True
-    )
+    mse, ssim = _picture_errors(found, true, counts)
     walls, true_walls = (found > 50) & counts, (true > 50) & counts
     tolerance_cells = tolerance_m / spec.resolution_m
     has_partner = walls & _within(true_walls, tolerance_cells)
     is_found = true_walls & _within(walls, tolerance_cells)
     known = (true >= 0) & counts
     return MapError(
-        mse=float(np.mean((picture - true_picture)[counts] ** 2)),
-        ssim=float(similarity[_interior(counts)].mean()),
+        mse=mse,
+        ssim=ssim,
         wall_iou=_iou(walls, walls & true_walls, true_walls, walls & true_walls),
         wall_iou_tolerant=_iou(walls, has_partner, true_walls, is_found),
         wall_precision=_share(has_partner, walls),
@@ -304,6 +311,25 @@ def map_sharpness(occupancy: OccupancyMap) -> MapSharpness:
         wall_share=float(walls.sum() / known.sum()),
         wall_thickness_cells=float(walls.sum() / skeletonize(walls).sum()),
     )
+
+
+def _picture_errors(
+    found: NDArray[np.int8], true: NDArray[np.int8], counts: BoolArray
+) -> tuple[float, float]:
+    """Mean squared difference and mean structural similarity of two maps as pictures."""
+    chosen, margin = _interior(counts), _SSIM_WINDOW // 2
+    squares = similarities = 0.0
+    for strip in _strips(len(found)):
+        low, high = max(strip.start - margin, 0), min(strip.stop + margin, len(found))
+        picture, true_picture = _picture(found[low:high]), _picture(true[low:high])
+        _, similarity = structural_similarity(
+            picture, true_picture, win_size=_SSIM_WINDOW, data_range=1.0, full=True
+        )
+        inside = slice(strip.start - low, strip.stop - low)
+        difference = (picture - true_picture)[inside][counts[strip]]
+        squares += float((difference**2).sum())
+        similarities += float(similarity[inside][chosen[strip]].sum())
+    return squares / int(counts.sum()), similarities / int(chosen.sum())
 
 
 def _rms(values: FloatArray) -> float:
