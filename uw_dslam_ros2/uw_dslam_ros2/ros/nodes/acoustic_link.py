@@ -18,10 +18,11 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.link import AcousticLink, Layer, LayerKey, LinkConfig
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.link_state import load_link_state, save_link_state
-from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_to_msg
+from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_id_of, submap_to_msg
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.plumbing.missing_submaps import MissingSubmaps
 from uw_dslam_ros2.ros.plumbing.node_settings import AcousticLinkConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import LATCHED, MODEM, SUBMAPS
@@ -69,10 +70,16 @@ class AcousticLinkNode(Node):
             self.create_subscription(
                 MergeStatus, "/merge_status", self._on_status, LATCHED, callback_group=group
             )
+        self._submap_topic = self.resolve_topic_name("submap")
+        self._wanted: dict[Track, int] = {}
+        self._missing = MissingSubmaps(
+            self, lambda job: job(), lambda _, msg: self._on_submap(msg)
+        )
         self._give(self._link.submaps())
         self._diagnostics = Diagnostics(self, self._report, self._vehicle_id)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_SAVE_PERIOD_S, self._save, clock=steady, callback_group=group)
+        self.create_timer(1.0, self._look_for_missing, clock=steady, callback_group=group)
 
     def stop(self) -> None:
         """Keep what was received."""
@@ -99,11 +106,36 @@ class AcousticLinkNode(Node):
     # --- callbacks ---------------------------------------------------------------------------
 
     def _on_submap(self, msg: SubmapMsg) -> None:
+        submap_id = submap_id_of(msg)
+        self._missing.note(self._submap_topic, submap_id)
+        self._wanted.setdefault(submap_id.track, 0)
+        self._wanted[submap_id.track] = max(self._wanted[submap_id.track], submap_id.sequence + 1)
         try:
             with self._lock:
-                self._give(self._link.add_submap(submap_from_msg(msg)))
+                found = self._taken(msg, submap_id)
         except InvalidInputError as error:
             self._complain(str(error))
+            return
+        self._give(found)
+
+    def _taken(self, msg: SubmapMsg, submap_id: SubmapId) -> list[Submap]:
+        held = self._link.own_submap(submap_id)
+        if not msg.is_pose_only:
+            return self._link.add_submap(submap_from_msg(msg))
+        if held is None:
+            return []  # the mapper is asked for it
+        return self._link.move_submap(submap_from_msg(msg, held))
+
+    def _look_for_missing(self) -> None:
+        """Ask the mapper for submaps that were sent before this node listened."""
+        missing = {}
+        for track, count in self._wanted.items():
+            with self._lock:
+                ids = [SubmapId(*track, sequence) for sequence in range(count)]
+                absent = [i.sequence for i in ids if self._link.own_submap(i) is None]
+            if absent:
+                missing[track] = absent
+        self._missing.look(missing)
 
     def _on_packet(self, msg: UInt8MultiArray) -> None:
         with self._lock:
