@@ -19,7 +19,7 @@ from uw_dslam_ros2.cli.mapping import Counter, OfflineConfig, settle
 from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging import MapProvenance, MapQueue, SubmapRecord
+from uw_dslam_ros2.core.merging import MapProvenance, MapQueue, MapQueueConfig, SubmapRecord
 from uw_dslam_ros2.core.merging.answers import Answer, Query
 from uw_dslam_ros2.core.merging.global_map import pinned_lattice
 from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
@@ -167,7 +167,7 @@ def merge_maps(
         settler(queue)
     else:
         settle(queue, config.registration, progress)
-    queue = _with_cells(queue, config)
+    queue = _with_cells(_in_frame_of_first(queue, maps, queue_config), config)
     outcome = outcome_of(queue)
     by_name = {one.name: one for one in maps}
     anchor = queue.to_state().anchor
@@ -239,6 +239,20 @@ def _known_box(occupancy: OccupancyMap) -> tuple[np.ndarray, np.ndarray]:
     return np.array([rows[0], cols[0]]), np.array([rows[-1], cols[-1]]) + 1
 
 
+def _in_frame_of_first(
+    queue: MapQueue, maps: Sequence[MapFile], config: MapQueueConfig
+) -> MapQueue:
+    """The same with the frame of the first map that is joined, or else of the first."""
+    component = {record.submap.vehicle_id: record.component for record in queue.submaps()}
+    numbers = list(component.values())
+    joined = [one.name for one in maps if numbers.count(component[one.name]) > 1]
+    name = config.anchor_vehicle or (joined[0] if joined else maps[0].name)
+    state = dataclasses.replace(queue.to_state(), anchor=None, lattice=None, is_pinned=False)
+    moved = MapQueue.from_state(state, dataclasses.replace(config, anchor_vehicle=name))
+    moved.submaps()  # pins the frame
+    return moved
+
+
 def _with_cells(queue: MapQueue, config: OfflineConfig) -> MapQueue:
     """The same queue, drawing on cells of the finest map that is joined, or of the chosen size."""
     state = queue.to_state()
@@ -260,7 +274,7 @@ def _with_cells(queue: MapQueue, config: OfflineConfig) -> MapQueue:
         )
     limit = max(config.queue.max_submap_cells, MAX_SIDE**2)
     return MapQueue.from_state(
-        dataclasses.replace(state, lattice=lattice),
+        dataclasses.replace(state, lattice=lattice, is_pinned=True),
         dataclasses.replace(config.queue, max_submap_cells=limit),
     )
 
