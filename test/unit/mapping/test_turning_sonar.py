@@ -14,7 +14,7 @@ from uw_dslam_ros2.core.mapping import (
     VehicleMapperConfig,
 )
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.sonar import Beams
+from uw_dslam_ros2.core.sonar import Beams, SonarConfig, detections_from_points
 
 S = 1_000_000_000
 SONAR = SE2(0.3, 0.0, 0.0)
@@ -153,6 +153,16 @@ def test_what_is_left_to_the_sonar_goes_by_its_beams():
     assert turning.information_share == pytest.approx(0.36, abs=0.01)
     own = MatchConfig(sigma_m=0.4, information_share=0.2)
     assert own.suited(0.0314) == own
+
+
+@pytest.mark.parametrize(("half_rad", "is_turn"), [(1.09, False), (math.pi, True)])
+def test_a_fan_of_wide_beams_is_no_turn(half_rad, is_turn):
+    """So its echoes, which come at once and err together, are kept and weighed as they are."""
+    bearing = np.arange(-half_rad, half_rad, 0.03)
+    wall = 10.0 * np.column_stack([np.cos(bearing), np.sin(bearing)])
+    config = SonarConfig(beamwidth_rad=0.03, neighbor_distance_m=0.0)
+    detections = detections_from_points(2 * S, wall, config)
+    assert detections.is_turn == is_turn
 
 
 def test_loops_see_the_walls_between_wide_beams(by_beams):

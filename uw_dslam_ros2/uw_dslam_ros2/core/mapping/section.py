@@ -120,7 +120,7 @@ class OpenSection:
             self._last_mapped = (stamp_ns, T_submap_base)
             T_submap_sonar = T_submap_base @ T_base_sonar
             self._draw(detections, T_submap_sonar)
-            self._keep(detections, T_submap_sonar)
+            self._keep(detections, T_submap_sonar, detections.is_turn)
 
     def add_sweep(self, sweep: PlacedSweep, T_submap_reference: SE2) -> None:
         """Add a sweep of a sonar that turns: all its beams, each from its own place."""
@@ -129,7 +129,7 @@ class OpenSection:
         self.num_pings += 1
         for part in sweep.slices:
             self._draw(part.detections, T_submap_reference @ part.T_reference_sonar)
-        self._keep(sweep.detections, T_submap_reference)
+        self._keep(sweep.detections, T_submap_reference, is_turn=True)
 
     def _go_on(self, stamp_ns: int, T_submap_base: SE2) -> None:
         if self._trajectory:
@@ -143,15 +143,13 @@ class OpenSection:
         if self._watch is not None:
             self._watch(detections, T_submap_sonar)
 
-    def _keep(self, detections: Detections, T_submap_sonar: SE2) -> None:
-        """Keep the echoes, and the walls between those of wide beams, for matching."""
+    def _keep(self, detections: Detections, T_submap_sonar: SE2, is_turn: bool) -> None:
+        """Keep the echoes, and of a turn the walls between its wide beams, for matching."""
         if len(detections.points):
-            points, weight = joined(
-                detections.points,
-                detections.weight,
-                detections.beamwidth_rad,
-                self._config.match.sigma_m,
-            )
+            points, weight = detections.points, detections.weight
+            if is_turn:
+                sigma_m = self._config.match.sigma_m
+                points, weight = joined(points, weight, detections.beamwidth_rad, sigma_m)
             self._points.append(T_submap_sonar.apply(points))
             self._weight.append(weight)
 

@@ -385,9 +385,10 @@ class VehicleMapper:
             return []
         if self._last_ping_ns is None:
             # Points of a turn come when it is over, and may be stamped with its middle.
-            is_turn = sweep is not None or detections.beamwidth_rad >= WIDE_BEAM_RAD
+            is_turn = sweep is not None or detections.is_turn
             self._navigation.remember(_TURN_MEMORY_S if is_turn else 0.0)
-            self._suit(detections.beamwidth_rad)
+            # Echoes of a fan are as near to each other as its settings say, and come at once.
+            self._suit(detections.beamwidth_rad if is_turn else _FAN_BEAM_RAD)
         self._last_ping_ns = detections.stamp_ns
         return self._process(detections, T_base_sonar, sweep)
 

@@ -13,6 +13,9 @@ __all__ = ["Detections", "SonarImage"]
 
 FloatArray = NDArray[np.float64]
 
+_AROUND_RAD = np.pi
+"""A fan leaves more than half of the circle, a turn less but where all walls lie on one side."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SonarImage:
@@ -53,6 +56,15 @@ class Detections:
     free_range_m: FloatArray
     beamwidth_rad: float
     range_sigma_m: float
+
+    @property
+    def is_turn(self) -> bool:
+        """Whether its beams look almost all around, as those of a sonar that turned."""
+        bearing = np.sort(np.mod(self.bearing_rad, 2.0 * np.pi))
+        if len(bearing) < 2:
+            return False
+        gaps = np.diff(np.append(bearing, bearing[0] + 2.0 * np.pi))
+        return bool(gaps.max() < _AROUND_RAD)
 
     def projected(self, projection: FloatArray) -> Detections:
         """The same seen from above: ``projection`` (2, 2) takes points of the fan to the plane."""
