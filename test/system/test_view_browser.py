@@ -77,8 +77,9 @@ def test_the_map_is_drawn_and_follows_zoom_and_drag(page):
     before = scale.inner_text()
     page.get_by_role("button", name="Zoom in").click()
     page.get_by_role("button", name="Zoom in").click()
-    page.wait_for_timeout(50)
     scale.filter(has_not_text=before).wait_for()
+    # While it still zooms it cannot be dragged.
+    page.locator(".leaflet-zoom-anim").wait_for(state="detached")
     pane = page.locator(".leaflet-map-pane")
     at_first = pane.get_attribute("style")
     box = page.locator("#map").bounding_box()

@@ -1,6 +1,7 @@
 """The server of the view, asked as a browser asks it, and as others should not."""
 
 import asyncio
+import dataclasses
 import io
 import itertools
 import json
@@ -12,6 +13,7 @@ import pytest
 from unit.cli import missions
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
 from uw_dslam_ros2.view.queue_source import QueueSource
@@ -57,6 +59,16 @@ def test_the_scene_holds_vehicles_submaps_and_matches(source):
     assert all(row["verdict"] and row["reason"] for row in scene["registrations"])
     ((status, _, _),) = answers(source, ["/api/scene"], headers={"If-None-Match": headers["ETag"]})
     assert status == 304
+
+
+def test_runs_are_counted_and_not_told_by_their_random_numbers():
+    queue = MapQueue()
+    for run_id, stamp_ns in ((3_000_000_000, 5), (7, 9)):
+        submap = missions.submap("auv_1")
+        queue.add_submap(dataclasses.replace(submap, run_id=run_id, stamp_ns=stamp_ns))
+    scene = QueueSource("two runs", queue).showing().scene()
+    assert [vehicle["name"] for vehicle in scene["vehicles"]] == ["auv_1", "auv_1#2"]
+    assert [moment["submap"] for moment in scene["moments"]] == ["auv_1/0", "auv_1#2/0"]
 
 
 def test_groups_stand_side_by_side(source):

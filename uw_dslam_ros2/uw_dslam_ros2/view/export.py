@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
-from uw_dslam_ros2.core.submap import track_name
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.trajectories import PoseGraphEdge, g2o_bytes, tum_bytes
+from uw_dslam_ros2.view.overview import Names
 from uw_dslam_ros2.view.showing import Showing
 
 __all__ = ["export_zip"]
@@ -64,7 +64,7 @@ def _files(showing: Showing, group: int, records: list[SubmapRecord]) -> dict[st
                 files[path.name] = path.read_bytes()
         spec = occupancy.spec
         files["map.pgw"] = _world_file(spec.resolution_m, spec.T_frame_grid.yaw, *_top_left(spec))
-    tracks = _tracks(records)
+    tracks = _tracks(records, showing.names)
     for name, (stamps_ns, poses) in tracks.items():
         files[f"{_plain(name)}.tum"] = tum_bytes(stamps_ns, poses)
     files["tracks.geojson"] = _geojson(tracks)
@@ -85,7 +85,7 @@ def _files(showing: Showing, group: int, records: list[SubmapRecord]) -> dict[st
     return files
 
 
-def _tracks(records: list[SubmapRecord]) -> dict[str, tuple[Any, Any]]:
+def _tracks(records: list[SubmapRecord], names: Names) -> dict[str, tuple[Any, Any]]:
     pieces: dict[str, list[tuple[Any, Any]]] = defaultdict(list)
     for record in records:
         submap = record.submap
@@ -97,7 +97,7 @@ def _tracks(records: list[SubmapRecord]) -> dict[str, tuple[Any, Any]]:
                     submap.trajectory[:, 2] + motion.yaw,
                 ]
             )
-            name = track_name(submap.submap_id.track)
+            name = names.track(submap.submap_id.track)
             pieces[name].append((submap.trajectory_stamp_ns, poses))
     tracks = {}
     for name, parts in sorted(pieces.items()):

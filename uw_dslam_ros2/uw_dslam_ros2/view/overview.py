@@ -14,9 +14,10 @@ from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import Constraint, ConstraintKind, SubmapRecord, SubmapState
 from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId, track_name
+from uw_dslam_ros2.core.submap import SubmapId, Track, track_name
 
 __all__ = [
+    "Names",
     "constraint_row",
     "outline_of",
     "registration_row",
@@ -28,6 +29,37 @@ FloatArray = NDArray[np.float64]
 
 _OUTLINE_CELL_M = 0.5
 _TRACK_STEP_M = 0.2
+
+
+class Names:
+    """Names for people: a run's number, drawn at random, becomes the first, second, ... run.
+
+    Parameters
+    ----------
+    records
+        Of all submaps; a vehicle's runs are counted by the times of their first submaps.
+    """
+
+    def __init__(self, records: Sequence[SubmapRecord]) -> None:
+        runs: dict[str, list[Track]] = {}
+        for record in sorted(records, key=lambda r: (r.submap.stamp_ns, r.submap.submap_id)):
+            track = record.submap.submap_id.track
+            known = runs.setdefault(track.vehicle_id, [])
+            if track not in known:
+                known.append(track)
+        self._shown = {
+            track: Track(vehicle_id, number)
+            for vehicle_id, tracks in runs.items()
+            for number, track in enumerate(tracks, start=1)
+        }
+
+    def track(self, track: Track) -> str:
+        """``auv_1``, and from a second run on ``auv_1#2``."""
+        return track_name(self._shown.get(track, track))
+
+    def submap(self, submap_id: SubmapId) -> str:
+        """``auv_1/3``."""
+        return f"{self.track(submap_id.track)}/{submap_id.sequence}"
 
 
 def outline_of(occupancy: OccupancyMap) -> FloatArray:
@@ -47,13 +79,13 @@ def outline_of(occupancy: OccupancyMap) -> FloatArray:
 
 
 def vehicle_rows(
-    records: Sequence[SubmapRecord], T_view_group: Mapping[int, SE2]
+    records: Sequence[SubmapRecord], T_view_group: Mapping[int, SE2], names: Names
 ) -> list[dict[str, Any]]:
     """Each run of each vehicle with its track, one piece for each submap, oldest first."""
     rows: dict[str, dict[str, Any]] = {}
     for record in records:
         submap = record.submap
-        name = track_name(submap.submap_id.track)
+        name = names.track(submap.submap_id.track)
         row = rows.setdefault(
             name, {"name": name, "num_submaps": 0, "num_merged": 0, "reason": "", "track": []}
         )
@@ -67,20 +99,22 @@ def vehicle_rows(
             motion = T_view_group[record.component] @ record.T_component_submap
             row["track"].append(
                 {
-                    "submap": str(submap.submap_id),
+                    "submap": names.submap(submap.submap_id),
                     "xy": _thinned(motion.apply(submap.trajectory[:, :2])),
                 }
             )
     return [rows[name] for name in sorted(rows)]
 
 
-def submap_row(record: SubmapRecord, outline: FloatArray, T_view_group: SE2) -> dict[str, Any]:
+def submap_row(
+    record: SubmapRecord, outline: FloatArray, T_view_group: SE2, names: Names
+) -> dict[str, Any]:
     """One submap."""
     submap = record.submap
     motion = T_view_group @ record.T_component_submap
     return {
-        "name": str(submap.submap_id),
-        "vehicle": track_name(submap.submap_id.track),
+        "name": names.submap(submap.submap_id),
+        "vehicle": names.track(submap.submap_id.track),
         "state": record.state.name.lower(),
         "group": record.component,
         "revision": submap.revision,
@@ -93,7 +127,7 @@ def submap_row(record: SubmapRecord, outline: FloatArray, T_view_group: SE2) -> 
 
 
 def constraint_row(
-    constraint: Constraint, places: Mapping[SubmapId, tuple[int, SE2]]
+    constraint: Constraint, places: Mapping[SubmapId, tuple[int, SE2]], names: Names
 ) -> dict[str, Any] | None:
     """One edge of the pose graph between two submaps that are shown, else None."""
     if constraint.source not in places or constraint.target not in places:
@@ -101,8 +135,8 @@ def constraint_row(
     (group, source), (other, target) = places[constraint.source], places[constraint.target]
     return {
         "kind": "odometry" if constraint.kind is ConstraintKind.ODOMETRY else "registration",
-        "source": str(constraint.source),
-        "target": str(constraint.target),
+        "source": names.submap(constraint.source),
+        "target": names.submap(constraint.target),
         "group": group if group == other else None,
         "line": _rounded(np.array([[source.x, source.y], [target.x, target.y]])),
         "residual_m": _number(constraint.residual_m),
@@ -113,14 +147,14 @@ def constraint_row(
 
 
 def registration_row(
-    number: int, answer: Answer, is_used: bool, names: Mapping[str, str]
+    number: int, answer: Answer, is_used: bool, sides: Mapping[str, str], names: Names
 ) -> dict[str, Any]:
-    """One answer in a line; `names` are those of its ``source`` and ``target``."""
+    """One answer in a line; `sides` name its ``source`` and ``target``."""
     motion, numbers = answer.T_target_source, answer.numbers
     sigma = np.sqrt(np.maximum(np.diag(answer.covariance), 0.0))
     return {
         "number": number,
-        **names,
+        **sides,
         "verdict": answer.verdict.name,
         "reason": answer.why,
         "is_used": is_used,
@@ -128,7 +162,9 @@ def registration_row(
         "pose": None if motion is None else _rounded(motion.as_array(), 4),
         "sigma": [_number(value) for value in sigma],
         "numbers": {name: _number(value) for name, value in sorted(numbers.items())},
-        "submaps": sorted({str(i) for i in (*answer.query.source.ids, *answer.query.target.ids)}),
+        "submaps": sorted(
+            {names.submap(i) for i in (*answer.query.source.ids, *answer.query.target.ids)}
+        ),
     }
 
 

@@ -24,8 +24,9 @@ from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
 from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap, SubmapGroup, render_group
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId, track_name
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.view.overview import (
+    Names,
     constraint_row,
     outline_of,
     registration_row,
@@ -67,6 +68,7 @@ class Showing:
         before: Showing | None = None,
     ) -> None:
         self.records = list(records)
+        self.names = Names(self.records)
         self.constraints = list(constraints)
         self._answers = list(answers)
         self._stored: dict[SubmapId, StoredSubmap] = dict(before._stored) if before else {}
@@ -106,22 +108,30 @@ class Showing:
             for r in self.records
             if r.state is not SubmapState.WITHDRAWN
         }
-        constraints = (constraint_row(c, places) for c in self.constraints)
+        constraints = (constraint_row(c, places, self.names) for c in self.constraints)
         return {
             "version": self.version,
             "moments": [
-                {"submap": str(r.submap.submap_id), "stamp_s": r.submap.stamp_ns * 1e-9}
+                {
+                    "submap": self.names.submap(r.submap.submap_id),
+                    "stamp_s": r.submap.stamp_ns * 1e-9,
+                }
                 for r in self._by_time
             ],
             "groups": self._group_rows(),
-            "vehicles": vehicle_rows(self.records, self._T_view_group),
+            "vehicles": vehicle_rows(self.records, self._T_view_group, self.names),
             "submaps": [
-                submap_row(r, self._outlines[r.submap.submap_id], self._T_view_group[r.component])
+                submap_row(
+                    r,
+                    self._outlines[r.submap.submap_id],
+                    self._T_view_group[r.component],
+                    self.names,
+                )
                 for r in self.records
             ],
             "constraints": [row for row in constraints if row is not None],
             "registrations": [
-                registration_row(number, answer, is_used, _sides(answer))
+                registration_row(number, answer, is_used, self._sides(answer), self.names)
                 for number, (answer, is_used) in enumerate(self._answers, start=1)
             ],
         }
@@ -153,7 +163,7 @@ class Showing:
                     continue
                 value = _value_at(record, place)
                 if value is not None:
-                    seen_by[str(record.submap.submap_id)] = value
+                    seen_by[self.names.submap(record.submap.submap_id)] = value
             if seen_by:
                 votes = [value > 50 for value in seen_by.values()]
                 return {
@@ -208,7 +218,7 @@ class Showing:
         return source, target
 
     def _rendered(self, group: SubmapGroup) -> OccupancyMap:
-        missing = [str(i) for i in group.ids if i not in self._stored]
+        missing = [self.names.submap(i) for i in group.ids if i not in self._stored]
         if missing:
             raise InvalidInputError(f"the submaps {', '.join(missing)} are not here any more")
         occupancy = render_group(group, self._stored, LOG_ODDS_MAX)
@@ -274,7 +284,7 @@ class Showing:
                 {
                     "group": group,
                     "frame": "map" if group == 0 else f"group {group}",
-                    "vehicles": sorted({track_name(r.submap.submap_id.track) for r in own}),
+                    "vehicles": sorted({self.names.track(r.submap.submap_id.track) for r in own}),
                     "num_submaps": len(own),
                     "shift": [shift.x, shift.y],
                     "bounds": [
@@ -286,6 +296,19 @@ class Showing:
                 }
             )
         return rows
+
+    def _sides(self, answer: Answer) -> dict[str, str]:
+        return {
+            "source": self._name_of(answer.query.source),
+            "target": self._name_of(answer.query.target),
+        }
+
+    def _name_of(self, group: SubmapGroup) -> str:
+        """The vehicles of a group, and how many submaps."""
+        if len(group.ids) == 1:
+            return self.names.submap(group.ids[0])
+        names = sorted({self.names.track(i.track) for i in group.ids})
+        return f"{' + '.join(names)} ({len(group.ids)} submaps)"
 
     def _fingerprint(self) -> str:
         hasher = hashlib.blake2b(digest_size=8)
@@ -308,18 +331,3 @@ def _value_at(record: SubmapRecord, place: FloatArray) -> int | None:
         return None
     value = int(grid.values[cells[0, 0], cells[0, 1]])
     return value if value >= 0 else None
-
-
-def _sides(answer: Answer) -> dict[str, str]:
-    return {
-        "source": _name_of(answer.query.source),
-        "target": _name_of(answer.query.target),
-    }
-
-
-def _name_of(group: SubmapGroup) -> str:
-    """The vehicles of a group, and how many submaps."""
-    names = sorted({track_name(i.track) for i in group.ids})
-    if len(group.ids) == 1:
-        return str(group.ids[0])
-    return f"{' + '.join(names)} ({len(group.ids)} submaps)"

@@ -16,7 +16,7 @@ from uw_dslam_msgs.srv import GetSubmap, ListRegistrations
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging.answers import Answer
-from uw_dslam_ros2.core.submap import Submap, SubmapId, track_name
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg
 from uw_dslam_ros2.ros.convert.merging import (
     answer_from_msg,
@@ -64,7 +64,7 @@ class View(Node):
         self._showing = Showing([], [])
         self._status: MergeStatus | None = None
         self._heard_s = float("-inf")
-        self._changed_s: dict[str, float] = {}
+        self._changed_s: dict[Track, float] = {}
         self._troubles: dict[str, str] = {}
         self._is_new, self._is_stopped = threading.Event(), threading.Event()
         self._server = ViewServer(
@@ -107,7 +107,10 @@ class View(Node):
             "message": "" if status is None else status.message,
             "num_servers": 0 if status is None else int(status.num_servers),
             "num_in_flight": 0 if status is None else int(status.num_in_flight),
-            "ages": {name: now_s - since_s for name, since_s in self._changed_s.items()},
+            "ages": {
+                self._showing.names.track(track): now_s - since_s
+                for track, since_s in list(self._changed_s.items())
+            },
             "notes": notes,
         }
 
@@ -158,7 +161,7 @@ class View(Node):
             if held is None or held.revision != info.revision:
                 held = self._fetch(submap_id)
                 self._submaps[submap_id] = held
-                self._changed_s[track_name(submap_id.track)] = time.monotonic()
+                self._changed_s[submap_id.track] = time.monotonic()
             records.append(record_from_msg(info, held))
         if status.num_registrations != self._num_answers:
             response = self._ask(self._list_registrations, ListRegistrations.Request())
