@@ -31,7 +31,7 @@ from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.session import UNSURE_EDGE
-from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum
+from uw_dslam_ros2.io.trajectories import PoseGraphEdge, invertible, write_g2o, write_tum
 
 __all__ = ["Outcome", "RegistrationRow", "VehicleOutcome", "outcome_of", "write_outcome"]
 
@@ -355,15 +355,10 @@ def _write_graph(path: Path, outcome: Outcome) -> None:
             numbers[c.target],
             numbers[c.source],
             c.T_target_source,
-            _regular(c),
+            invertible(c.covariance),
             UNSURE_EDGE if c.is_unsure else "",
         )
         for c in outcome.constraints
         if c.is_inlier and numbers[c.source] in vertices and numbers[c.target] in vertices
     ]
     write_g2o(path, vertices, edges)
-
-
-def _regular(constraint: Constraint) -> FloatArray:
-    """Odometry may claim to be perfect; a g2o file needs an inverse."""
-    return constraint.covariance + np.diag([1e-6, 1e-6, 1e-8])

@@ -23,7 +23,6 @@ from typing import IO, Any
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
@@ -44,7 +43,7 @@ from uw_dslam_ros2.io.session_file import (
     read_records,
     write_records,
 )
-from uw_dslam_ros2.io.trajectories import PoseGraphEdge, write_g2o, write_tum
+from uw_dslam_ros2.io.trajectories import PoseGraphEdge, invertible, write_g2o, write_tum
 
 __all__ = [
     "GOOD_FILE",
@@ -286,18 +285,13 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
             keys[c.target],
             keys[c.source],
             c.T_target_source,
-            _regular(c.covariance) if c.kind is ConstraintKind.ODOMETRY else c.covariance,
+            invertible(c.covariance) if c.kind is ConstraintKind.ODOMETRY else c.covariance,
             UNSURE_EDGE if c.is_unsure else "",
         )
         for c in queue.constraints()
         if c.is_inlier and c.source in keys and c.target in keys
     ]
     return [*written, write_g2o(folder / "graph.g2o", vertices, edges)]
-
-
-def _regular(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Odometry may claim to be perfect; a g2o file needs an inverse."""
-    return covariance + np.diag([1e-6, 1e-6, 1e-8])
 
 
 def _file_name(vehicle_id: str, run_id: int = 0) -> str:

@@ -18,6 +18,7 @@ from uw_dslam_ros2.io.atomic import write_files
 __all__ = [
     "PoseGraphEdge",
     "g2o_bytes",
+    "invertible",
     "read_g2o",
     "read_tum",
     "tum_bytes",
@@ -115,6 +116,11 @@ def g2o_bytes(vertices: Mapping[int, SE2], edges: Sequence[PoseGraphEdge]) -> by
             f"{motion.x:.9g} {motion.y:.9g} {motion.yaw:.12g} {numbers}\n"
         )
     return "".join(lines).encode()
+
+
+def invertible(covariance: FloatArray) -> FloatArray:
+    """Covariance (3, 3) with an inverse, which a file needs; odometry may claim to be perfect."""
+    return covariance + np.diag([1e-6, 1e-6, 1e-8])
 
 
 def write_g2o(

@@ -14,7 +14,7 @@ import numpy as np
 
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
 from uw_dslam_ros2.io.maps import write_map
-from uw_dslam_ros2.io.trajectories import PoseGraphEdge, g2o_bytes, tum_bytes
+from uw_dslam_ros2.io.trajectories import PoseGraphEdge, g2o_bytes, invertible, tum_bytes
 from uw_dslam_ros2.view.overview import Names
 from uw_dslam_ros2.view.showing import Showing
 
@@ -75,8 +75,7 @@ def _files(showing: Showing, group: int, records: list[SubmapRecord]) -> dict[st
             keys[c.target],
             keys[c.source],
             c.T_target_source,
-            # Odometry may claim to be perfect; the file needs an inverse.
-            c.covariance + np.diag([1e-6, 1e-6, 1e-8]),
+            invertible(c.covariance),
         )
         for c in showing.constraints
         if c.is_inlier and c.source in keys and c.target in keys
