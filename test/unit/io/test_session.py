@@ -90,6 +90,25 @@ class InterruptedWriteError(Exception):
     pass
 
 
+def save_fails_at(fail_at, folder, queue, monkeypatch):
+    """Save, interrupted at so many calls of the database; False where it was done before that."""
+    calls, real = iter(range(10_000)), sqlite3.connect
+
+    class Failing(sqlite3.Connection):
+        def execute(self, *args):
+            if next(calls) == fail_at:
+                raise InterruptedWriteError
+            return super().execute(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sqlite3, "connect", lambda *a, **k: real(*a, factory=Failing, **k))
+        try:
+            save_session(folder, queue)
+        except InterruptedWriteError:
+            return True
+    return False
+
+
 def test_a_failure_at_any_step_leaves_the_old_session_whole(tmp_path, monkeypatch):
     """Fail at each statement in turn: what loads is the old state until the commit is through."""
     old = filled()
@@ -99,24 +118,8 @@ def test_a_failure_at_any_step_leaves_the_old_session_whole(tmp_path, monkeypatc
     new.withdraw(("auv_1", 0, 1))
     before, after = contents(old), contents(new)
     assert before != after
-    real = sqlite3.connect
     for fail_at in range(1000):
-        calls = iter(range(10_000))
-
-        class Failing(sqlite3.Connection):
-            def execute(self, *args, calls=calls, fail_at=fail_at):
-                if next(calls) == fail_at:
-                    raise InterruptedWriteError
-                return super().execute(*args)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(sqlite3, "connect", lambda *a, f=Failing, **k: real(*a, factory=f, **k))
-            try:
-                save_session(tmp_path, new)
-            except InterruptedWriteError:
-                failed = True
-            else:
-                failed = False
+        failed = save_fails_at(fail_at, tmp_path, new, monkeypatch)
         assert contents(load_session(tmp_path)) == (before if failed else after)
         if not failed:
             break

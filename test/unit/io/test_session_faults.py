@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from unit.io.test_session import FLEET, InterruptedWriteError, contents, filled
+from unit.io.test_session import FLEET, contents, filled, save_fails_at
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import MapQueue
@@ -30,26 +30,11 @@ DATA = Path(__file__).parent / "data"
 
 
 def test_a_first_save_interrupted_anywhere_is_no_session_yet(tmp_path, monkeypatch):
-    queue, real = filled(), sqlite3.connect
+    queue = filled()
     for fail_at in range(1000):
         folder = tmp_path / str(fail_at)
-        calls = iter(range(10_000))
-
-        class Failing(sqlite3.Connection):
-            def execute(self, *args, calls=calls, fail_at=fail_at):
-                if next(calls) == fail_at:
-                    raise InterruptedWriteError
-                return super().execute(*args)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(sqlite3, "connect", lambda *a, f=Failing, **k: real(*a, factory=f, **k))
-            try:
-                save_session(folder, queue)
-            except InterruptedWriteError:
-                failed = True
-            else:
-                break
-        assert failed
+        if not save_fails_at(fail_at, folder, queue, monkeypatch):
+            break
         with Session(folder) as session:
             assert session.load() is None
             session.save(queue)

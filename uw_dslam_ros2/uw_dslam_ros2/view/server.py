@@ -158,7 +158,7 @@ class ViewServer:
 
     def _refusal(self, request: web.Request) -> web.Response | None:
         host = request.host.rsplit(":", 1)[0].strip("[]")
-        if not self._token and not (host == "localhost" or _is_loopback_name(host)):
+        if not self._token and not _is_own_name(host):
             # Another name that resolves to this machine is another site's doing.
             return web.Response(status=403, text=f"this view is not served as {host}")
         origin = request.headers.get("Origin")
@@ -302,10 +302,10 @@ class ViewServer:
         return await asyncio.get_running_loop().run_in_executor(self._pool, work)
 
 
-def _is_loopback_name(host: str) -> bool:
+def _is_own_name(host: str) -> bool:
     try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
+        return is_loopback(host)
+    except InvalidInputError:
         return False
 
 
