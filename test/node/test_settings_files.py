@@ -10,6 +10,7 @@ import rclpy
 import yaml
 
 from uw_dslam_ros2.core.errors import ConfigError
+from uw_dslam_ros2.io import settings as settings_files
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
 from uw_dslam_ros2.ros.nodes.sonar_mapper import SonarMapper
@@ -118,3 +119,7 @@ def test_every_parameter_has_its_text():
 
 def _rows(tables):
     return [line for line in tables.splitlines() if line.startswith("| `")]
+
+
+def test_a_settings_file_may_name_every_node_that_has_settings():
+    assert set(settings_files.NODES) == set(NODE_CONFIGS)

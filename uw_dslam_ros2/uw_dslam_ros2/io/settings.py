@@ -86,6 +86,7 @@ NODES = (
     "bag_player",
     "acoustic_link",
     "channel",
+    "view",
 )
 _SENSOR_SETTINGS = {field.name for field in fields(SensorConfig)}
 _EVERY_NODE = "/**"
