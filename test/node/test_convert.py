@@ -15,8 +15,8 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging.answers import Answer, Query
-from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
+from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
     RegistrationResult,

@@ -16,7 +16,7 @@ from uw_dslam_ros2.cli.outcome import RegistrationRow, names_of, outcome_of, wri
 from uw_dslam_ros2.cli.report import RunFacts, render_html
 from uw_dslam_ros2.cli.scoring import score
 from uw_dslam_ros2.core.merging import MapQueue
-from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId

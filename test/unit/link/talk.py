@@ -1,7 +1,7 @@
 """Links that talk over a simulated channel, for tests."""
 
 from uw_dslam_ros2.core.link import AcousticLink, LinkConfig
-from uw_dslam_ros2.core.link.channel import ChannelConfig, SharedChannel
+from uw_dslam_ros2.core.link.transport.channel import ChannelConfig, SharedChannel
 
 
 class Talk:

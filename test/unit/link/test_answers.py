@@ -10,9 +10,9 @@ from unit.link.talk import Talk
 from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.link import answers
-from uw_dslam_ros2.core.link.answers import AnswerExchange, decode_answer, encode_answer
-from uw_dslam_ros2.core.link.packets import OVERHEAD_BYTES
+from uw_dslam_ros2.core.link.coding import answers
+from uw_dslam_ros2.core.link.coding.answers import AnswerExchange, decode_answer, encode_answer
+from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.link.cell_coder import decode_cells, encode_cells
+from uw_dslam_ros2.core.link.coding.cell_coder import decode_cells, encode_cells
 
 CELLS = array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24).flatmap(
     lambda shape: st.tuples(

@@ -1,7 +1,7 @@
 import pytest
 
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.core.link.channel import CHANNEL_PRESETS, ChannelConfig, SharedChannel
+from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig, SharedChannel
 
 NEAR = {1: (0.0, 0.0), 2: (150.0, 0.0), 3: (0.0, 300.0)}
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.link.erasure import MAX_INDEX, fragment, restore
+from uw_dslam_ros2.core.link.transport.erasure import MAX_INDEX, fragment, restore
 
 
 def test_the_first_fragments_are_the_data():

@@ -12,7 +12,7 @@ from unit.link.talk import Talk
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.link import AcousticLink, Layer, LayerKey, LinkConfig
-from uw_dslam_ros2.core.link.packets import OVERHEAD_BYTES
+from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES
 from uw_dslam_ros2.core.se2 import SE2
 
 
@@ -240,7 +240,7 @@ def test_noise_is_counted(data):
 
 
 def test_packets_with_a_sound_checksum_and_any_content_harm_nothing(rng):
-    from uw_dslam_ros2.core.link.packets import Packet
+    from uw_dslam_ros2.core.link.transport.packets import Packet
 
     link = AcousticLink(LinkConfig(number=1), "auv_1")
     for _ in range(2000):

@@ -13,7 +13,7 @@ from uw_dslam_ros2.core.mapping import (
     VehicleMapper,
     VehicleMapperConfig,
 )
-from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.navigation import NavigationConfig
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import SonarConfig

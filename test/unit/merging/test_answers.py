@@ -8,8 +8,8 @@ import pytest
 from unit.merging.fleet import three_vehicles
 
 from uw_dslam_ros2.core.merging import MapQueue
-from uw_dslam_ros2.core.merging.answers import Answer, Query, Use
-from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, Use
+from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.session import load_session, save_session

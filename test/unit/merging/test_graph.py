@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.merging.consistency import Side, consistent_set, cycle_distance
-from uw_dslam_ros2.core.merging.library import milestone
+from uw_dslam_ros2.core.merging.graph.consistency import Side, consistent_set, cycle_distance
+from uw_dslam_ros2.core.merging.graph.library import milestone
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.pose_graph import (
     compose_covariance,

@@ -11,10 +11,10 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
 from uw_dslam_ros2.core.merging import queue as queue_module
-from uw_dslam_ros2.core.merging.components import Constraint
-from uw_dslam_ros2.core.merging.library import Library
-from uw_dslam_ros2.core.merging.soundness import contradicting_track
-from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
+from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track
+from uw_dslam_ros2.core.merging.graph.components import Constraint
+from uw_dslam_ros2.core.merging.graph.library import Library
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track

@@ -2,7 +2,7 @@ import pytest
 from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.link import Layer
-from uw_dslam_ros2.core.link.channel import ChannelConfig
+from uw_dslam_ros2.core.link.transport.channel import ChannelConfig
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
 from uw_dslam_ros2.sim.link_mission import run_link

@@ -20,9 +20,9 @@ from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapProvenance, MapQueue, MapQueueConfig, SubmapRecord
-from uw_dslam_ros2.core.merging.answers import Answer, Query
 from uw_dslam_ros2.core.merging.global_map import pinned_lattice
-from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
+from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.pose_graph import compose_covariance, invert_covariance
 from uw_dslam_ros2.core.registration import (
     GridRegistrationConfig,

@@ -24,7 +24,7 @@ from uw_dslam_ros2.core.merging import (
     SubmapRecord,
     SubmapState,
 )
-from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track, track_name
 from uw_dslam_ros2.io.atomic import write_files

@@ -27,8 +27,8 @@ import numpy as np
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, QueueState
-from uw_dslam_ros2.core.merging.answers import Answer, Query
-from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
+from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.link import AcousticLink, Layer, LayerKey, LinkConfig, LinkCounts
-from uw_dslam_ros2.core.link.channel import ChannelConfig, ChannelCounts, SharedChannel
+from uw_dslam_ros2.core.link.transport.channel import ChannelConfig, ChannelCounts, SharedChannel
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = ["LinkRun", "run_link"]

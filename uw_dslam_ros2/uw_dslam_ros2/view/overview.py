@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import Constraint, ConstraintKind, SubmapRecord, SubmapState
-from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track, track_name
 

@@ -18,10 +18,10 @@ from uw_dslam_ros2.core.merging import (
     SubmapRecord,
     SubmapState,
 )
-from uw_dslam_ros2.core.merging.answers import Answer
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
-from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap, SubmapGroup, render_group
+from uw_dslam_ros2.core.merging.graph.answers import Answer
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapGroup, render_group
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId

@@ -9,8 +9,8 @@ import pytest
 
 from uw_dslam_ros2.core.features.grid_filter import clean_cells
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.registration.grids.agreement import WallMap
-from uw_dslam_ros2.core.registration.grids.covariance import (
+from uw_dslam_ros2.core.registration.grids.judging.agreement import WallMap
+from uw_dslam_ros2.core.registration.grids.judging.covariance import (
     curvature,
     pose_spread,
 )

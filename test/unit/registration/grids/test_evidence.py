@@ -10,18 +10,22 @@ from scipy.optimize import minimize
 
 from uw_dslam_ros2.core.features.grid_filter import clean_cells
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.registration.grids.agreement import Agreement, WallMap, measure_agreement
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.lines import off_strongest_lines
-from uw_dslam_ros2.core.registration.grids.probability import (
+from uw_dslam_ros2.core.registration.grids.judging.agreement import (
+    Agreement,
+    WallMap,
+    measure_agreement,
+)
+from uw_dslam_ros2.core.registration.grids.judging.lines import off_strongest_lines
+from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MatchEvidence,
     PoseEvidence,
     pose_logit,
     probability_of,
 )
+from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.problem import build_problem
 from uw_dslam_ros2.core.registration.grids.register import match_evidence, register_grids
-from uw_dslam_ros2.core.registration.grids.verdict import decide
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import is_right, make_pair

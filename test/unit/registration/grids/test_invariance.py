@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
-from uw_dslam_ros2.core.registration.grids.verdict import decide
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.sim.map_pairs import make_pair, pair_errors
 from uw_dslam_ros2.sim.map_variants import VARIANTS, mirrored

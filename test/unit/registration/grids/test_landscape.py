@@ -6,9 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.registration.grids import landscape as grid_landscape
-from uw_dslam_ros2.core.registration.grids import landscape_kernels
-from uw_dslam_ros2.core.registration.grids.landscape import distinct, scan_landscape
+from uw_dslam_ros2.core.registration.grids.finding import landscape as grid_landscape
+from uw_dslam_ros2.core.registration.grids.finding import landscape_kernels
+from uw_dslam_ros2.core.registration.grids.finding.landscape import distinct, scan_landscape
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grids.signed_field import PAD, padded_field
 from uw_dslam_ros2.core.registration.search.field import Field

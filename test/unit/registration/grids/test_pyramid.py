@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.registration.grids import candidates
-from uw_dslam_ros2.core.registration.grids.candidates import log_volume, scan_candidates
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.frames import GridFrames
-from uw_dslam_ros2.core.registration.grids.landscape import Landscape
+from uw_dslam_ros2.core.registration.grids.finding import candidates
+from uw_dslam_ros2.core.registration.grids.finding.candidates import log_volume, scan_candidates
+from uw_dslam_ros2.core.registration.grids.finding.frames import GridFrames
+from uw_dslam_ros2.core.registration.grids.finding.landscape import Landscape
+from uw_dslam_ros2.core.registration.grids.finding.search import whole_plane
 from uw_dslam_ros2.core.registration.grids.preparation import prepare_maps
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
-from uw_dslam_ros2.core.registration.grids.search import whole_plane
 from uw_dslam_ros2.sim.map_pairs import MapPair, cut_pair, is_right
 
 

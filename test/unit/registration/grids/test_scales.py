@@ -6,7 +6,7 @@ import pytest
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.grids import preparation
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.probability import probability_of
+from uw_dslam_ros2.core.registration.grids.judging.probability import probability_of
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
 from uw_dslam_ros2.sim.map_pairs import MapNoise, MapPair, damage, is_right, make_pair
 

@@ -5,9 +5,9 @@ import pytest
 
 from uw_dslam_ros2.core.features.grid_filter import clean_cells
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.registration.grids.landscape import scan_landscape
+from uw_dslam_ros2.core.registration.grids.finding.landscape import scan_landscape
+from uw_dslam_ros2.core.registration.grids.finding.search import search_poses, whole_plane
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow, build_problem
-from uw_dslam_ros2.core.registration.grids.search import search_poses, whole_plane
 from uw_dslam_ros2.core.registration.grids.signed_field import PAD, signed_field, wall_distance
 from uw_dslam_ros2.core.registration.search import kernels
 from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome, SearchSettings, Status

@@ -8,15 +8,15 @@ from dataclasses import replace
 
 import pytest
 
-from uw_dslam_ros2.core.registration.grids.agreement import Agreement
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.probability import (
+from uw_dslam_ros2.core.registration.grids.judging.agreement import Agreement
+from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MODELS,
     MatchEvidence,
     PoseEvidence,
     probability_of,
 )
-from uw_dslam_ros2.core.registration.grids.verdict import (
+from uw_dslam_ros2.core.registration.grids.judging.verdict import (
     _RULES,
     MOST_RIVAL_PROBABILITY,
     Proof,

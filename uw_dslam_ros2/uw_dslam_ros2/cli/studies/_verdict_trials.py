@@ -12,7 +12,7 @@ import numpy as np
 from uw_dslam_ros2.cli.studies._apart_maps import different_pairs, matching_pairs, twin_pairs
 from uw_dslam_ros2.cli.studies._common import progress
 from uw_dslam_ros2.cli.studies._map_pairs import PairSpec, random_prior
-from uw_dslam_ros2.core.registration.grids.probability import (
+from uw_dslam_ros2.core.registration.grids.judging.probability import (
     POSE_FEATURES,
     MatchEvidence,
     PoseEvidence,

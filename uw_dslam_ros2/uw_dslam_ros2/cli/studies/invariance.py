@@ -15,8 +15,8 @@ import numpy as np
 
 from uw_dslam_ros2.cli.studies._common import print_table, progress, write_csv
 from uw_dslam_ros2.cli.studies._map_pairs import pair_specs
+from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, match_evidence
-from uw_dslam_ros2.core.registration.grids.verdict import decide
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import MapPair, pair_errors

@@ -29,7 +29,7 @@ from uw_dslam_ros2.cli.studies._common import (
 from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission, demo_mission
 from uw_dslam_ros2.cli.studies.merging import merged_largest, placing_error
 from uw_dslam_ros2.core.link import Layer, LayeredSubmap, encode_submap
-from uw_dslam_ros2.core.link.channel import CHANNEL_PRESETS, ChannelConfig
+from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.sim.link_mission import LinkRun, run_link
 

@@ -8,7 +8,7 @@ whether the best pose is right, in view of its strongest rival. The first model 
 pose is the best, so after it has changed much the evidence has to be gathered once more for the
 second to be that of its choices. The models are judged on other seeds and on kinds of places that
 the fit never saw. The coefficients that this command prints are those of
-`uw_dslam_ros2.core.registration.grids.probability.MODELS`.
+`uw_dslam_ros2.core.registration.grids.judging.probability.MODELS`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from uw_dslam_ros2.cli.studies._common import (
     share_interval,
 )
 from uw_dslam_ros2.cli.studies._verdict_trials import Trial, apart_tasks, gathered, window_tasks
-from uw_dslam_ros2.core.registration.grids.probability import (
+from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MATCH_FEATURES,
     POSE_FEATURES,
     VerdictModels,
@@ -38,8 +38,8 @@ from uw_dslam_ros2.core.registration.grids.probability import (
     probability_of,
     rival_probability,
 )
+from uw_dslam_ros2.core.registration.grids.judging.verdict import MOST_RIVAL_PROBABILITY, decide
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.verdict import MOST_RIVAL_PROBABILITY, decide
 from uw_dslam_ros2.core.registration.result import Verdict
 
 FloatArray = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """What crosses an acoustic link: submaps in a few hundred bytes."""
 
-from uw_dslam_ros2.core.link.codec import (
+from uw_dslam_ros2.core.link.coding.codec import (
     CODEC_VERSION,
     CellLayer,
     Layer,
@@ -8,9 +8,9 @@ from uw_dslam_ros2.core.link.codec import (
     encode_submap,
     read_outline,
 )
-from uw_dslam_ros2.core.link.items import LayerKey
+from uw_dslam_ros2.core.link.coding.items import LayerKey
+from uw_dslam_ros2.core.link.coding.outline import Outline
 from uw_dslam_ros2.core.link.link import AcousticLink
-from uw_dslam_ros2.core.link.outline import Outline
 from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState
 
 __all__ = [

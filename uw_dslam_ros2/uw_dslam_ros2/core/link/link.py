@@ -9,16 +9,15 @@ import dataclasses
 from collections.abc import Iterator
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.link.codec import (
+from uw_dslam_ros2.core.link.coding.codec import (
     Layer,
     LayeredSubmap,
     encode_submap,
     read_outline,
     write_outline,
 )
-from uw_dslam_ros2.core.link.fields import ByteReader
-from uw_dslam_ros2.core.link.inbox import Inbox
-from uw_dslam_ros2.core.link.items import (
+from uw_dslam_ros2.core.link.coding.fields import ByteReader
+from uw_dslam_ros2.core.link.coding.items import (
     Ask,
     ItemKind,
     LayerKey,
@@ -31,8 +30,9 @@ from uw_dslam_ros2.core.link.items import (
     read_layer,
     read_note,
 )
-from uw_dslam_ros2.core.link.outbox import Outbox, OutItem
-from uw_dslam_ros2.core.link.packets import OVERHEAD_BYTES, Packet, bundled, unbundled
+from uw_dslam_ros2.core.link.transport.inbox import Inbox
+from uw_dslam_ros2.core.link.transport.outbox import Outbox, OutItem
+from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES, Packet, bundled, unbundled
 from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 

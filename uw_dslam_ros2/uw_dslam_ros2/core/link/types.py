@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.config import Config, setting
-from uw_dslam_ros2.core.link.packets import MAX_PACKET_BYTES, MAX_SENDERS, MIN_PACKET_BYTES
+from uw_dslam_ros2.core.link.transport.packets import (
+    MAX_PACKET_BYTES,
+    MAX_SENDERS,
+    MIN_PACKET_BYTES,
+)
 
 __all__ = ["LinkConfig", "LinkCounts", "LinkState"]
 

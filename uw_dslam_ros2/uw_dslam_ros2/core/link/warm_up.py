@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from uw_dslam_ros2.core.link.cell_coder import decode_cells, encode_cells
-from uw_dslam_ros2.core.link.cells import reduce_cells
+from uw_dslam_ros2.core.link.coding.cell_coder import decode_cells, encode_cells
+from uw_dslam_ros2.core.link.coding.cells import reduce_cells
 
 __all__ = ["warm_up"]
 

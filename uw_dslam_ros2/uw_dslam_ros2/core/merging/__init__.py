@@ -1,7 +1,7 @@
 """Many submaps of many vehicles, in any order, into one map."""
 
-from uw_dslam_ros2.core.merging.components import LoopError
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.graph.components import LoopError
 from uw_dslam_ros2.core.merging.growing_map import GrowingMap, GrowingMapConfig, MapChange
 from uw_dslam_ros2.core.merging.queue import MapQueue
 from uw_dslam_ros2.core.merging.start_poses import StartPoses

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging.answers import Answer, Query, QueryKey
-from uw_dslam_ros2.core.merging.components import Component, LoopError, loop_errors
+from uw_dslam_ros2.core.merging.asking.growing import make_growing_plan
+from uw_dslam_ros2.core.merging.asking.pairwise import make_pairwise_plan
+from uw_dslam_ros2.core.merging.asking.plan import Plan, make_plan
+from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track, implausible_submaps
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MapQueueConfig
 from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice, undrawable
-from uw_dslam_ros2.core.merging.growing import make_growing_plan
-from uw_dslam_ros2.core.merging.library import Library, Memory
-from uw_dslam_ros2.core.merging.pairwise import make_pairwise_plan
-from uw_dslam_ros2.core.merging.plan import Plan, make_plan
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
+from uw_dslam_ros2.core.merging.graph.components import Component, LoopError, loop_errors
+from uw_dslam_ros2.core.merging.graph.library import Library, Memory
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.records import constraints_of, records_of
-from uw_dslam_ros2.core.merging.soundness import contradicting_track, implausible_submaps
 from uw_dslam_ros2.core.merging.state import QueueState
-from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     MapProvenance,

@@ -6,10 +6,10 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
-from uw_dslam_ros2.core.merging.answers import Answer
-from uw_dslam_ros2.core.merging.components import Component
-from uw_dslam_ros2.core.merging.plan import Plan, component_numbers
-from uw_dslam_ros2.core.merging.submap_groups import StoredSubmap
+from uw_dslam_ros2.core.merging.asking.plan import Plan, component_numbers
+from uw_dslam_ros2.core.merging.graph.answers import Answer
+from uw_dslam_ros2.core.merging.graph.components import Component
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,

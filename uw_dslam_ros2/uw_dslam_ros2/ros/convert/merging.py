@@ -21,8 +21,8 @@ from uw_dslam_msgs.msg import Constraint as ConstraintMsg
 from visualization_msgs.msg import Marker, MarkerArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.merging.answers import Answer, Query
-from uw_dslam_ros2.core.merging.submap_groups import SubmapGroup
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
+from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,

@@ -17,7 +17,7 @@ from rclpy.node import Node
 from std_msgs.msg import Empty, UInt8MultiArray
 
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.core.link.channel import CHANNEL_PRESETS, ChannelConfig, SharedChannel
+from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig, SharedChannel
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.node_settings import ChannelNodeConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters

@@ -15,7 +15,7 @@ from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.srv import GetSubmap, ListRegistrations
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.merging.answers import Answer
+from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg
 from uw_dslam_ros2.ros.convert.merging import (

@@ -18,7 +18,7 @@ from typing import Any
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.link import LinkConfig
-from uw_dslam_ros2.core.link.channel import ChannelConfig
+from uw_dslam_ros2.core.link.transport.channel import ChannelConfig
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.merging import GrowingMapConfig, MapQueueConfig
 from uw_dslam_ros2.core.registration import GridRegistrationConfig, RegistrationConfig

@@ -14,8 +14,8 @@ from uw_dslam_ros2.core.features.grid_points import grid_points
 from uw_dslam_ros2.core.features.sampling import sample_voxels, voxel_size
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
-from uw_dslam_ros2.core.registration.grids.agreement import WallMap, measure_agreement
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grids.judging.agreement import WallMap, measure_agreement
 from uw_dslam_ros2.core.registration.points.register import register_point_sets
 from uw_dslam_ros2.core.registration.result import PriorWindow, Progress, RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2

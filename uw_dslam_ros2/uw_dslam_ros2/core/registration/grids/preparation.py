@@ -9,8 +9,8 @@ import numpy as np
 
 from uw_dslam_ros2.core.features.grid_filter import FilteredCells, clean_cells, coarsen
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.registration.grids.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grids.judging.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.problem import build_problem
 from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid
 

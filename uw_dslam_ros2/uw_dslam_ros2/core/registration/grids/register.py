@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.registration.grids.candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.crop import crop_to_known
-from uw_dslam_ros2.core.registration.grids.evidence import Found, weigh
-from uw_dslam_ros2.core.registration.grids.frames import GridFrames
-from uw_dslam_ros2.core.registration.grids.paper import register_grids_by_points
-from uw_dslam_ros2.core.registration.grids.preparation import prepare_maps
-from uw_dslam_ros2.core.registration.grids.probability import (
+from uw_dslam_ros2.core.registration.grids.finding.candidates import merge_best, scan_candidates
+from uw_dslam_ros2.core.registration.grids.finding.frames import GridFrames
+from uw_dslam_ros2.core.registration.grids.finding.search import search_poses
+from uw_dslam_ros2.core.registration.grids.judging.evidence import Found, weigh
+from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MatchEvidence,
     PoseEvidence,
     probability_of,
 )
+from uw_dslam_ros2.core.registration.grids.judging.symmetry import add_symmetric_rivals
+from uw_dslam_ros2.core.registration.grids.judging.verdict import Proof, decide
+from uw_dslam_ros2.core.registration.grids.paper import register_grids_by_points
+from uw_dslam_ros2.core.registration.grids.preparation import prepare_maps
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid
-from uw_dslam_ros2.core.registration.grids.search import search_poses
-from uw_dslam_ros2.core.registration.grids.symmetry import add_symmetric_rivals
-from uw_dslam_ros2.core.registration.grids.verdict import Proof, decide
 from uw_dslam_ros2.core.registration.result import (
     PriorWindow,
     Progress,

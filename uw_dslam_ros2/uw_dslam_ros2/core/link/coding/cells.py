@@ -1,0 +1,117 @@
+"""A submap's grid as cells of three values, coarse or fine, and back."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.link.coding.cell_coder import CELL_FREE, CELL_WALL, CellArray
+from uw_dslam_ros2.core.mosaic import fuse_maps
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["known_window", "levelled", "occupancy_of", "reduce_cells", "spread"]
+
+# As sure as a mapper is of a cell that it saw often.
+_FREE_PERCENT, _WALL_PERCENT = 5, 95
+_WALL_MIN_PERCENT = 60
+_FREE_MAX_PERCENT = 40
+_MIN_WALL_CELLS = 3
+"""Walls that touch each other; fewer are a speck."""
+
+
+def levelled(occupancy: OccupancyMap, unit_m: float) -> OccupancyMap:
+    """The same map on cells whose size is a whole number of `unit_m`, with axes of the frame."""
+    spec = occupancy.spec
+    units = round(spec.resolution_m / unit_m)
+    is_whole = units > 0 and abs(spec.resolution_m - units * unit_m) < 1e-9
+    if is_whole and spec.T_frame_grid.yaw == 0.0:
+        return occupancy
+    lattice = GridSpec(max(1, units) * unit_m, 1, 1)
+    drawn = fuse_maps(lattice, [(occupancy, SE2())], 8.0)
+    return occupancy if drawn is None else drawn
+
+
+@njit(cache=True, nogil=True)
+def count_blocks(values, size, side, free_max, wall_min):  # type: ignore[no-untyped-def]
+    """Walls and free cells (2, R, C) of a map [percent] in blocks of ``size`` x ``size`` cells.
+
+    R and C are multiples of `side`; what lies beyond the map is unknown.
+    """
+    rows = -(-values.shape[0] // (size * side)) * side
+    cols = -(-values.shape[1] // (size * side)) * side
+    counts = np.zeros((2, rows, cols), np.int32)
+    for row in range(values.shape[0]):
+        for col in range(values.shape[1]):
+            value = values[row, col]
+            if value >= wall_min:
+                counts[0, row // size, col // size] += 1
+            elif 0 <= value <= free_max:
+                counts[1, row // size, col // size] += 1
+    return counts
+
+
+def reduce_cells(values: NDArray[np.int8], size: int) -> dict[int, CellArray]:
+    """Cells of three values, one, two and three blocks of ``size`` x ``size`` a side, by that.
+
+    A cell is a wall if half of a line through it is, else free if a third of it is, else unknown;
+    see `drop_specks` for the rest. All begin at the map's first cell and reach equally far.
+    """
+    counts = count_blocks(values, size, 6, _FREE_MAX_PERCENT, _WALL_MIN_PERCENT)
+    found = {}
+    for factor in (1, 2, 3):
+        _, rows, cols = counts.shape
+        blocks = counts.reshape(2, rows // factor, factor, cols // factor, factor)
+        num_walls, num_free = blocks.sum(axis=(2, 4))
+        cells = np.zeros(num_free.shape, np.int8)
+        width = factor * size
+        cells[3 * num_free >= width * width] = CELL_FREE
+        cells[num_walls >= max(1, (width + 1) // 2)] = CELL_WALL
+        found[factor] = drop_specks(cells)
+    return found
+
+
+def drop_specks(cells: CellArray) -> CellArray:
+    """Without walls that stand alone, and with free and unknown cells as most around them are."""
+    wall = cells == CELL_WALL
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(wall.astype(np.uint8), connectivity=8)
+    is_kept = stats[:, cv2.CC_STAT_AREA] >= _MIN_WALL_CELLS
+    is_kept[0] = False
+    wall = is_kept[labels]
+    free = (cells == CELL_FREE) | ((cells == CELL_WALL) & ~wall)
+    count = cv2.boxFilter(
+        free.astype(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    kept = np.zeros_like(cells)
+    kept[count >= 5] = CELL_FREE
+    kept[wall] = CELL_WALL
+    return kept
+
+
+def known_window(cells: CellArray) -> tuple[slice, slice]:
+    """Rows and columns around everything known; empty where nothing is."""
+    rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
+    if len(rows) == 0:
+        return slice(0, 0), slice(0, 0)
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+def spread(
+    coarse: CellArray, coarse_factor: int, shape: tuple[int, int], factor: int
+) -> CellArray:
+    """For each cell of a finer grid from the same corner, the coarse cell under its middle."""
+    rows, cols = (((2 * np.arange(n) + 1) * factor) // (2 * coarse_factor) for n in shape)
+    wide = np.zeros((shape[0], shape[1]), np.int8)
+    inside = np.ix_(rows < coarse.shape[0], cols < coarse.shape[1])
+    picked = coarse[np.ix_(rows[rows < coarse.shape[0]], cols[cols < coarse.shape[1]])]
+    wide[inside] = picked
+    return wide
+
+
+def occupancy_of(cells: CellArray, resolution_m: float, x: float, y: float) -> OccupancyMap:
+    """An ordinary map of cells whose outer corner lies at (x, y) [m]."""
+    table = np.array([UNKNOWN, _FREE_PERCENT, _WALL_PERCENT], np.int8)
+    spec = GridSpec(resolution_m, cells.shape[0], cells.shape[1], SE2(x, y))
+    return OccupancyMap(spec, table[cells])

@@ -1,0 +1,1 @@
+"""Layers to packets and back over a shared channel that loses some."""

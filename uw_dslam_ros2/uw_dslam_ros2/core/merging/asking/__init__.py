@@ -1,0 +1,1 @@
+"""Which submaps to register next."""

@@ -1,0 +1,1 @@
+"""Which answers hold against all others, and which vehicles are set aside."""

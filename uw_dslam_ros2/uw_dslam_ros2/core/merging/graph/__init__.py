@@ -1,0 +1,1 @@
+"""What is known: submaps, odometry, answers, and which of them are joined."""

@@ -1,0 +1,240 @@
+"""All submaps that are known, and what has been worked out of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.merging.config import (
+    INLIER_PROBABILITY,
+    LOG_ODDS_MAX,
+    MAX_MAP_CELLS,
+    MAX_MAP_SIDE,
+    NUM_NEIGHBOURS,
+)
+from uw_dslam_ros2.core.merging.graph.answers import Query
+from uw_dslam_ros2.core.merging.graph.components import Component, Constraint, solve_components
+from uw_dslam_ros2.core.merging.graph.consistency import Side
+from uw_dslam_ros2.core.merging.graph.descriptors import NO_SHAPE, MapShape, shape_of
+from uw_dslam_ros2.core.merging.graph.odometry import Odometry
+from uw_dslam_ros2.core.merging.graph.submap_groups import (
+    StoredSubmap,
+    SubmapGroup,
+    joint_box,
+    lattice_box,
+    render_group,
+    shared_area_m2,
+)
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId, Track
+
+__all__ = ["Library", "Memory", "milestone"]
+
+FloatArray = NDArray[np.float64]
+Memory = dict[Hashable, Any]
+"""Results by what they depend on; may be thrown away at any time."""
+
+_GROWTH = 1.5
+_PART_LENGTH = 6
+"""Consecutive submaps in a part of a track's map that is matched by itself."""
+_MAX_MEMORY = 200_000
+
+
+def milestone(count: int) -> int:
+    """Largest of 1, 2, 3, 4, 6, 9, 13, 19, ... that is not above a count.
+
+    A map is matched anew when it has grown by half, and not with each submap.
+    """
+    reached = 1
+    while (following := max(reached + 1, int(reached * _GROWTH))) <= count:
+        reached = following
+    return reached
+
+
+class Library:
+    """Groups and sides of one state of the submaps.
+
+    Parameters
+    ----------
+    submaps
+        All; withdrawn ones still carry their track's odometry.
+    withdrawn
+        Those that are neither matched nor drawn.
+    memory
+        Kept from state to state by the caller.
+    """
+
+    def __init__(
+        self,
+        submaps: Mapping[SubmapId, StoredSubmap],
+        withdrawn: frozenset[SubmapId],
+        memory: Memory,
+    ) -> None:
+        self.submaps = submaps
+        self.odometry = Odometry(submaps)
+        self._memory = memory
+        if len(memory) > _MAX_MEMORY:
+            memory.clear()
+        self.active = {
+            i: s for i, s in sorted(submaps.items()) if i not in withdrawn and len(s.footprint)
+        }
+        self._by_track: dict[Track, list[SubmapId]] = {}
+        for submap_id in self.active:
+            self._by_track.setdefault(submap_id.track, []).append(submap_id)
+        self._state = tuple(
+            (i, s.submap.T_odom_submap, s.submap.covariance.tobytes())
+            for i, s in sorted(submaps.items())
+        )
+
+    def whole_groups(self) -> dict[Track, SubmapGroup]:
+        """Each track's map up to its last milestone, of closed submaps where there are any."""
+        groups = {}
+        for track in self._by_track:
+            ids = self.closed(track)
+            groups[track] = self._odometry_group(ids[: milestone(len(ids))])
+        return groups
+
+    @property
+    def tracks(self) -> list[Track]:
+        """Those that have something to match, sorted."""
+        return sorted(self._by_track)
+
+    def closed(self, track: Track) -> list[SubmapId]:
+        """A track's closed submaps; all of them where none is closed yet."""
+        ids = self._by_track[track]
+        return [i for i in ids if self.active[i].submap.is_final] or ids
+
+    def closed_group(self, track: Track) -> SubmapGroup:
+        """All of a track's closed submaps."""
+        return self._odometry_group(self.closed(track))
+
+    def window(self, submap_id: SubmapId) -> SubmapGroup:
+        """A submap with its neighbours along its track."""
+        ids = self.closed(submap_id.track)
+        index = ids.index(submap_id)
+        reach = NUM_NEIGHBOURS if len(ids) > 2 * NUM_NEIGHBOURS + 1 else 0
+        low, high = max(0, index - reach), index + reach + 1
+        return self._odometry_group(ids[low:high], submap_id)
+
+    def parts(self, side: Side) -> list[SubmapGroup]:
+        """Stretches of each track in a side, overlapping by half; never all of a track."""
+        groups: list[SubmapGroup] = []
+        for track in sorted({submap_id.track for submap_id in side.T_frame_submap}):
+            ids = self.closed(track)
+            length = min(_PART_LENGTH, -(-len(ids) // 2))
+            stride = max(1, length // 2)
+            last = len(ids) - length
+            for start in sorted({*range(0, last, stride), last}):
+                groups.append(self._odometry_group(ids[start : start + length]))
+        return groups
+
+    def component_group(self, side: Side) -> SubmapGroup:
+        """Everything in a side as one map."""
+        ids = sorted(side.T_frame_submap)
+        members = [self.active[i] for i in ids]
+        poses = [side.T_frame_submap[i] for i in ids]
+        return SubmapGroup.of(members, poses, len(ids) // 2)
+
+    def track_side(self, track: Track) -> Side:
+        """A track's closed submaps, placed by its own odometry."""
+        return self.side_of(self.closed(track))
+
+    def side_of(self, ids: Sequence[SubmapId]) -> Side:
+        """Submaps of one track, placed by its own odometry."""
+        poses = {i: self.odometry.T_odom_submap(i) for i in ids}
+        return Side(poses, self.odometry.covariance)
+
+    def component_side(self, component: Component, track: Track | None = None) -> Side:
+        """The closed submaps of a component, or of one track in it, placed by the graph."""
+        tracks = sorted({i.track for i in component}) if track is None else [track]
+        ids = [i for t in tracks if t in self._by_track for i in self.closed(t)]
+        poses = {i: component[i] for i in ids if i in component}
+        first = {t: self.closed(t)[0] for t in tracks if t in self._by_track}
+
+        def covariance(target: SubmapId, source: SubmapId) -> FloatArray:
+            if target.track == source.track:
+                return self.odometry.covariance(target, source)
+            # Through each track's beginning: an honest guess from above.
+            return self.odometry.covariance(target, first[target.track]) + (
+                self.odometry.covariance(source, first[source.track])
+            )
+
+        return Side(poses, covariance)
+
+    def holds(self, query: Query) -> bool:
+        """Whether all submaps of a question are still in use."""
+        return all(i in self.active for i in (*query.source.ids, *query.target.ids))
+
+    def why_too_large(self, group: SubmapGroup) -> str:
+        """Why a group cannot be made one map; empty if it can."""
+        return self._remember(("size", group.key), lambda: self._why_too_large(group))
+
+    def _why_too_large(self, group: SubmapGroup) -> str:
+        lattice = self.submaps[group.reference].submap.grid.spec
+        boxes = [
+            lattice_box(lattice, self.submaps[i].submap.grid.spec, T)
+            for i, T in group.T_reference_submap.items()
+        ]
+        rows, cols = np.diff(joint_box(boxes), axis=0)[0].tolist()
+        if max(rows, cols) <= MAX_MAP_SIDE and rows * cols <= MAX_MAP_CELLS:
+            return ""
+        return (
+            f"not matched: the map of {len(boxes)} submaps has {rows:.0f} x {cols:.0f} cells of "
+            f"{lattice.resolution_m:g} m, at most {MAX_MAP_SIDE} a side and {MAX_MAP_CELLS:.0e} "
+            "in all are"
+        )
+
+    def render(self, group: SubmapGroup) -> OccupancyMap:
+        """The group's map; not remembered, for its size."""
+        occupancy = render_group(group, self.submaps, LOG_ODDS_MAX)
+        assert occupancy is not None, "active submaps hold something"
+        return occupancy
+
+    def shape(self, group: SubmapGroup) -> MapShape:
+        """Descriptor of the group's map."""
+        if self.why_too_large(group):
+            return NO_SHAPE
+        return self._remember(("shape", group.key), lambda: shape_of(self.render(group)))
+
+    def rough_shape(self, track: Track) -> MapShape:
+        """Descriptor of a track's map, as it was at its last milestone."""
+        ids = self.closed(track)[: milestone(len(self.closed(track)))]
+        key = ("rough", tuple((i, self.active[i].digest) for i in ids))
+        return self._remember(key, lambda: self.shape(self._odometry_group(ids)))
+
+    def shared_area_m2(self, source: SubmapId, target: SubmapId, T_target_source: SE2) -> float:
+        """Area that two submaps have both seen."""
+        first, second = self.submaps[source], self.submaps[target]
+        if math.hypot(T_target_source.x, T_target_source.y) > first.radius_m + second.radius_m:
+            return 0.0
+        key = ("area", first.digest, second.digest, T_target_source)
+        return self._remember(key, lambda: shared_area_m2(first, second, T_target_source))
+
+    def solve(
+        self, anchor: SubmapId, constraints: Sequence[Constraint]
+    ) -> tuple[list[Constraint], list[Component]]:
+        """Solve the pose graph; see `components.solve_components`."""
+        # One answer may serve several matches; it is one edge.
+        unique = {constraint.key: constraint for constraint in constraints}
+        key = ("graph", self._state, anchor, tuple(sorted(unique)))
+        edges, own = self.odometry.edges, list(unique.values())
+        return self._remember(
+            key, lambda: solve_components(self.submaps, anchor, edges, own, INLIER_PROBABILITY)
+        )
+
+    def _odometry_group(
+        self, ids: Sequence[SubmapId], reference: SubmapId | None = None
+    ) -> SubmapGroup:
+        members = [self.active[i] for i in ids]
+        poses = [self.odometry.T_odom_submap(i) for i in ids]
+        return SubmapGroup.of(members, poses, ids.index(reference) if reference else len(ids) // 2)
+
+    def _remember(self, key: Hashable, work: Any) -> Any:
+        if key not in self._memory:
+            self._memory[key] = work()
+        return self._memory[key]

@@ -1,0 +1,1 @@
+"""Where one map may lie in another: candidates, and the search that proves."""

@@ -1,0 +1,182 @@
+"""Probability that a match of two maps is right, from measured quantities.
+
+The coefficients are fitted on simulated pairs by `study verdict`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from uw_dslam_ros2.core.registration.grids.judging.agreement import Agreement
+
+__all__ = [
+    "ENOUGH_DETAIL",
+    "MATCH_FEATURES",
+    "MODELS",
+    "POSE_FEATURES",
+    "MatchEvidence",
+    "PoseEvidence",
+    "VerdictModels",
+    "match_features",
+    "pose_features",
+    "pose_logit",
+    "probability_of",
+    "rival_probability",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEvidence:
+    """What is known about one pose of two maps.
+
+    ``score`` is the objective on the finest level, ``surprise`` how far that on the searched level
+    lies above what chance alignments of these two maps reach, in standard deviations of such.
+    """
+
+    agreement: Agreement
+    score: float
+    surprise: float
+
+
+@dataclass(frozen=True, slots=True)
+class MatchEvidence:
+    """What is known about the best pose of two maps, the most convincing one, and its rivals.
+
+    ``deviation_m`` is the best pose's standard deviation in the direction that is fixed the least,
+    at the rim for turns; ``extent_m`` the root mean square distance of the walls of the smaller
+    map from their mean. ``log_volume`` is the logarithm of the number of poses that were searched:
+    the more there are, the better the best of them is by chance. ``cell_m`` is the side of the
+    cells on which the maps agree best, and which all of this is counted in.
+    """
+
+    best: PoseEvidence
+    rivals: tuple[PoseEvidence, ...]
+    deviation_m: float
+    extent_m: float
+    log_volume: float
+    cell_m: float
+
+    @property
+    def rival_share(self) -> float:
+        """Greatest score of a rival over the best pose's."""
+        most = max((rival.score for rival in self.rivals), default=0.0)
+        return max(most, 0.0) / max(self.best.score, 1e-9)
+
+
+ENOUGH_DETAIL = 600.0
+"""More cells of detail are no more proof: chance matches of large maps have them too."""
+# Wall cells next to each other agree or not together: so many count as one (design effect, the
+# scatter of sums over squares against that of independent cells: 2.5 to 6 in noisy maps).
+_CELLS_PER_SAMPLE = 5.0
+_LEAST_VARIANCE = 0.005  # of one sample, as if one in two hundred disagreed
+_LIKE_DETAIL = 0.02  # how much of the best pose's detail it shows at least, sharing less area
+
+POSE_FEATURES = (
+    "agreement",
+    "conflict",
+    "log_detail",
+    "wall_share",
+    "log_surprise",
+    "log_volume",
+)
+MATCH_FEATURES = ("pose", "rival")
+_MOST_LOGIT = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictModels:
+    """Logistic models, intercept first: of a pose for itself, and of the best among rivals."""
+
+    pose: tuple[float, ...]
+    match: tuple[float, ...]
+
+
+MODELS = VerdictModels(
+    pose=(-1.7782, 5.6615, -18.5572, 1.15, -6.7008, 0.819, -0.2288),
+    match=(0.3367, 0.7635, -1.1911),
+)
+"""Fitted by `study verdict` with its default settings, which prints them."""
+
+
+def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
+    """Quantities that speak for or against a pose by itself, as `POSE_FEATURES`."""
+    agreement = pose.agreement
+    return (
+        agreement.agreement,
+        agreement.conflict,
+        math.log1p(min(agreement.num_detail, ENOUGH_DETAIL) / _CELLS_PER_SAMPLE),
+        agreement.wall_share,
+        math.log(min(max(pose.surprise, 0.5), 30.0)),
+        log_volume,
+    )
+
+
+def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tuple[float, ...]:
+    """Logit of the best pose for itself, and how convincing its strongest rival is, from 0 up."""
+    best = _logit(pose_model, pose_features(evidence.best, evidence.log_volume))
+    rivals = [
+        _logit(pose_model, pose_features(rival, evidence.log_volume)) - _doubt(evidence, rival)
+        for rival in evidence.rivals
+    ]
+    return best, math.log1p(math.exp(max(rivals))) if rivals else 0.0
+
+
+def _doubt(evidence: MatchEvidence, rival: PoseEvidence) -> float:
+    """What speaks against a rival as the true pose of a place that looks like itself.
+
+    The true pose agrees as well as its alias, for the maps are the same, and in the same kind of
+    detail. What agrees significantly less is repeated walls: the best pose would have to agree
+    better by chance than the true one, with a likelihood of exp(-z^2 / 2) at z standard errors.
+    """
+    best, other = evidence.best.agreement, rival.agreement
+    if other.num_detail < _LIKE_DETAIL * best.num_detail:
+        return 2.0 * _MOST_LOGIT
+    return 0.5 * max(_lead(best, other), 0.0) ** 2
+
+
+def probability_of(
+    evidence: MatchEvidence, models: VerdictModels = MODELS, *, is_alone: bool = False
+) -> float:
+    """Probability in [0, 1] that the best pose is right, of models fitted on simulated pairs.
+
+    ``is_alone`` leaves the rivals out.
+    """
+    if is_alone:
+        evidence = replace(evidence, rivals=())
+    return _share(_logit(models.match, match_features(evidence, models.pose)))
+
+
+def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MODELS) -> float:
+    """Logit that a pose is right, from what speaks for it by itself."""
+    return _logit(models.pose, pose_features(pose, log_volume))
+
+
+def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
+    """How probable the most convincing rival would be if the best pose were not there."""
+    logits = [
+        pose_logit(rival, evidence.log_volume, models) - _doubt(evidence, rival)
+        for rival in evidence.rivals
+    ]
+    return _share(_logit(models.match, (max(logits), 0.0))) if logits else 0.0
+
+
+def _share(logit: float) -> float:
+    return 1.0 / (1.0 + math.exp(-logit))
+
+
+def _lead(best: Agreement, rival: Agreement) -> float:
+    """By how many standard errors one pose agrees better than another."""
+    variance = 0.0
+    for pose in (best, rival):
+        one = max(pose.agreement * (1.0 - pose.agreement), _LEAST_VARIANCE)
+        variance += one / max(pose.num_walls / _CELLS_PER_SAMPLE, 1.0)
+    return (best.agreement - rival.agreement) / math.sqrt(variance)
+
+
+def _logit(model: Sequence[float], features: Sequence[float]) -> float:
+    logit = model[0] + sum(c * x for c, x in zip(model[1:], features, strict=True))
+    if math.isnan(logit):
+        return -_MOST_LOGIT  # what is not a number speaks for nothing
+    return max(-_MOST_LOGIT, min(_MOST_LOGIT, logit))
