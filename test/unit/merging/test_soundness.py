@@ -10,7 +10,7 @@ from unit.merging.fleet import map_bytes
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
-from uw_dslam_ros2.core.merging import queue as queue_module
+from uw_dslam_ros2.core.merging import planning as planning_module
 from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track
 from uw_dslam_ros2.core.merging.graph.components import Constraint
 from uw_dslam_ros2.core.merging.graph.library import Library
@@ -170,7 +170,7 @@ def test_a_run_that_contradicts_the_rest_is_set_aside_until_it_does_not(monkeypa
     def blame(library, *_):
         return liar if blamed and any(i.track == liar for i in library.submaps) else None
 
-    monkeypatch.setattr(queue_module, "contradicting_track", blame)
+    monkeypatch.setattr(planning_module, "contradicting_track", blame)
     queue.withdraw(max(fleet.submaps))
     answer_all(queue, KnowingMatcher(fleet))
     states = by_vehicle(queue)

@@ -75,7 +75,7 @@ class Library:
         withdrawn: frozenset[SubmapId],
         memory: Memory,
     ) -> None:
-        self.submaps = submaps
+        self.submaps, self.withdrawn = submaps, withdrawn
         self.odometry = Odometry(submaps)
         self._memory = memory
         if len(memory) > _MAX_MEMORY:

@@ -1,0 +1,115 @@
+"""From submaps and answers to a plan that leaves out what cannot be right."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
+
+from uw_dslam_ros2.core.merging.asking.growing import make_growing_plan
+from uw_dslam_ros2.core.merging.asking.pairwise import make_pairwise_plan
+from uw_dslam_ros2.core.merging.asking.plan import Plan, make_plan
+from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track, implausible_submaps
+from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
+from uw_dslam_ros2.core.merging.graph.library import Library, Memory
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
+from uw_dslam_ros2.core.submap import SubmapId, Track
+
+__all__ = ["Planning"]
+
+_CONTRADICTS = "set aside with its whole run, which contradicts the others' maps"
+
+
+class Planning:
+    """Makes plans, and remembers what it has worked out and whom it has set aside."""
+
+    def __init__(self, config: MapQueueConfig) -> None:
+        self._config = config
+        self._memory: Memory = {}
+        self._implausible: dict[SubmapId, str] = {}
+        self._contradicting: list[Track] = []
+        self.aside: dict[SubmapId, str] = {}
+        """What the last plan leaves out, and why."""
+
+    def library(
+        self, submaps: Mapping[SubmapId, StoredSubmap], withdrawn: AbstractSet[SubmapId]
+    ) -> Library:
+        """All submaps but those that their own odometry shows to be impossible."""
+        self._implausible = implausible_submaps(submaps, self._config.max_speed_m_s, self._memory)
+        kept = {i: s for i, s in submaps.items() if i not in self._implausible}
+        return Library(kept, frozenset(withdrawn), self._memory)
+
+    def plan(
+        self,
+        library: Library,
+        tracks: Sequence[Track],
+        answers: Mapping[QueryKey, Answer],
+        standing: AbstractSet[QueryKey],
+        anchor: SubmapId | None,
+        *,
+        is_growing: bool,
+    ) -> Plan:
+        """A plan without the runs that others agree better without.
+
+        Parameters
+        ----------
+        library
+            As `library` gave it.
+        tracks
+            In order of first arrival.
+        answers, standing, anchor
+            See `make_plan`.
+        is_growing
+            Whether more submaps are expected soon.
+        """
+
+        def plan_with(sound: Library) -> Plan:
+            return self._plan_with(sound, tracks, answers, standing, anchor, is_growing=is_growing)
+
+        plan = plan_with(library)
+        if not is_growing and not plan.wanted:
+            self._contradicting = []
+            whole, sound = plan, library
+            while len(self._contradicting) < len(tracks) and not plan.wanted:
+                track = contradicting_track(sound, plan.constraints, min(sound.submaps))
+                if track is None:
+                    break
+                self._contradicting.append(track)
+                sound = self._without(library, self._contradicting)
+                plan = plan_with(sound)
+            plan = dataclasses.replace(plan, wanted=[*whole.wanted, *plan.wanted])
+        elif held := [track for track in self._contradicting if track in tracks]:
+            # While questions are open, what was judged before goes on to hold.
+            wanted = plan.wanted
+            plan = plan_with(self._without(library, held))
+            known = {query.key for query in wanted}
+            wanted += [query for query in plan.wanted if query.key not in known]
+            plan = dataclasses.replace(plan, wanted=wanted)
+        self.aside = self._implausible | {
+            i: _CONTRADICTS for i in library.submaps if i.track in self._contradicting
+        }
+        return plan
+
+    def _without(self, library: Library, tracks: Sequence[Track]) -> Library:
+        kept = {i: s for i, s in library.submaps.items() if i.track not in tracks}
+        return Library(kept, library.withdrawn, self._memory)
+
+    def _plan_with(
+        self,
+        library: Library,
+        tracks: Sequence[Track],
+        answers: Mapping[QueryKey, Answer],
+        standing: AbstractSet[QueryKey],
+        anchor: SubmapId | None,
+        *,
+        is_growing: bool,
+    ) -> Plan:
+        if anchor not in library.submaps:
+            anchor = min(library.submaps)
+        assert anchor is not None
+        if self._config.mode == "pairwise":
+            known = [track for track in tracks if any(i.track == track for i in library.submaps)]
+            return make_pairwise_plan(library, known, answers, anchor, is_growing=is_growing)
+        make = make_growing_plan if is_growing else make_plan
+        return make(library, answers, standing, anchor, self._config)
