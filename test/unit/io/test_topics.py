@@ -61,6 +61,28 @@ def test_two_vehicles_are_found_whatever_their_topics_are_called(leaves, above, 
         assert "odometry" not in vehicle.topics
 
 
+@pytest.mark.parametrize("group", ["sensors", "payload", "hull/bow"])
+def test_a_group_of_sensors_has_not_the_vehicles_name(group):
+    tables = [
+        table(f"/auv_{n}/{group}", has_truth=False) | {f"/auv_{n}/truth/odom": ODOMETRY}
+        for n in (1, 2)
+    ]
+    vehicles = find_vehicles(tables, ["first", "second"])
+    assert [(v.vehicle_id, v.namespace) for v in vehicles] == [
+        ("auv_1", "auv_1"),
+        ("auv_2", "auv_2"),
+    ]
+    for vehicle in vehicles:
+        assert vehicle.topics["sonar"] == f"/{vehicle.vehicle_id}/{group}/sonar"
+        assert vehicle.topics["truth"] == f"/{vehicle.vehicle_id}/truth/odom"
+
+
+def test_groups_without_a_vehicle_above_have_the_name_of_the_bag():
+    (vehicle,) = find_vehicles([table("/sensors", has_truth=False)], ["dive_3"])
+    assert (vehicle.vehicle_id, vehicle.namespace) == ("dive_3", "")
+    assert vehicle.topics["imu"] == "/sensors/imu"
+
+
 @pytest.mark.parametrize("leaves", ["plain", "drivers"])
 def test_a_vehicle_without_a_namespace_has_the_name_of_its_bag(leaves):
     tables = [table("", leaves), table("", leaves)]

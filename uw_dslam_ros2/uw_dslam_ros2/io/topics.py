@@ -63,6 +63,11 @@ _NAMES = {
     "fix": ("fix", "usbl", "gps", "gnss", "navsat"),
 }  # fmt: skip
 _TRUTH = {"truth", "ground_truth", "groundtruth", "gt"}
+# Words by which drivers are grouped; no vehicle has such a name.
+_GROUPS = {
+    "mavros", "sensor", "sensors", "instrument", "instruments", "payload", "nav", "navigation",
+    "driver", "drivers", "device", "devices", "hardware", "hw", "raw", "data", "topics",
+}  # fmt: skip
 # Not measurements: what somebody wants, what has been made of a sensor, or a camera.
 _NO_MEASUREMENT = {
     "cmd", "command", "desired", "setpoint", "goal", "reference", "target", "camera", "viewer",
@@ -142,10 +147,11 @@ def find_vehicles(
     """
     namespaces: dict[tuple[str, str], list[int]] = {}
     shared = _first_of_parts(tables, names)
-    for index, (table, name) in enumerate(zip(tables, names, strict=True)):
-        for namespace in _namespaces(table):
-            vehicle_id = parts_of(namespace)[-1] if namespace else shared or name
-            namespaces.setdefault((vehicle_id, namespace), []).append(index)
+    found = [(index, own) for index, table in enumerate(tables) for own in _namespaces(table)]
+    shortened = _without_shared_ends([own for _, own in found])
+    for (index, _), namespace in zip(found, shortened, strict=True):
+        vehicle_id = parts_of(namespace)[-1] if namespace else shared or names[index]
+        namespaces.setdefault((vehicle_id, namespace), []).append(index)
     ids = [vehicle_id for vehicle_id, _ in namespaces]
     vehicles = []
     for (vehicle_id, namespace), indices in sorted(namespaces.items()):
@@ -317,6 +323,16 @@ def _split(
     return [_before_a_sensor(prefix)]
 
 
+def _without_shared_ends(namespaces: Sequence[str]) -> list[str]:
+    """``auv_1/hull`` and ``auv_2/hull`` are the vehicles auv_1 and auv_2."""
+    all_parts = [parts_of(namespace) for namespace in namespaces]
+    ends = zip(*(reversed(parts) for parts in all_parts), strict=False)
+    for num_shared, last in enumerate(ends):
+        if len(set(last)) > 1:
+            return ["/".join(parts[: len(parts) - num_shared]) for parts in all_parts]
+    return list(namespaces)  # of one vehicle, or one has nothing that the others have not
+
+
 def _has_all(roles: set[str], others: set[str]) -> bool:
     """Whether a vehicle with these roles needs none of the others."""
     if "velocity" not in roles and "odometry" not in roles and others & {"velocity", "odometry"}:
@@ -325,8 +341,8 @@ def _has_all(roles: set[str], others: set[str]) -> bool:
 
 
 def _before_a_sensor(prefix: tuple[str, ...]) -> tuple[str, ...]:
-    """A lone ``/auv_1/imu/data`` is in namespace auv_1, not auv_1/imu."""
-    words = {word for group in _NAMES.values() for word in group} | {"mavros"}
+    """A lone ``/auv_1/imu/data`` is in namespace auv_1, not auv_1/imu or auv_1/sensors."""
+    words = {word for group in _NAMES.values() for word in group} | _GROUPS
     while prefix and prefix[-1].lower() in words:
         prefix = prefix[:-1]
     return prefix
