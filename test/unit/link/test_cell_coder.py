@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.link.coding.cell_coder import decode_cells, encode_cells
+from uw_dslam_ros2.core.link.coding.cell_coder import (
+    decode_cells,
+    decode_walls,
+    encode_cells,
+    encode_walls,
+)
 
 CELLS = array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24).flatmap(
     lambda shape: st.tuples(
@@ -31,6 +36,12 @@ def room(size=120):
 def test_cells_come_back(both):
     cells, coarse = both
     np.testing.assert_array_equal(decode_cells(encode_cells(cells, coarse), coarse), cells)
+
+
+@given(CELLS)
+def test_walls_come_back(both):
+    walls, coarse = both[0] == 2, both[1]
+    np.testing.assert_array_equal(decode_walls(encode_walls(walls, coarse), coarse), walls)
 
 
 @pytest.mark.parametrize("value", [0, 1, 2])
@@ -59,7 +70,7 @@ def test_any_bytes_decode_to_cells(data):
 
 
 def test_the_answer_does_not_change_with_the_version_of_anything():
-    """What is on the wire is a format: these bytes are what version 1 of the codec means."""
+    """What is on the wire is a format: these bytes are what the codec's version means."""
     cells = room()[15:60, 10:50]
     data = encode_cells(cells, np.zeros_like(cells))
     assert data.hex() == "da2638cdcb2432a65717363666179785"

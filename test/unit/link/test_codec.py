@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.link import Layer, LayeredSubmap, encode_submap, read_outline
-from uw_dslam_ros2.core.metrics import interpolate_poses
+from uw_dslam_ros2.core.link.coding.cells import with_walls
+from uw_dslam_ros2.core.metrics import interpolate_poses, resample
 from uw_dslam_ros2.core.se2 import SE2
 
 COVARIANCE = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.0004]])
@@ -93,6 +94,24 @@ def test_a_finer_layer_needs_the_one_below():
     assert held.cells.layer is Layer.COARSE
 
 
+def test_walls_told_exactly_leave_free_space_on_the_side_that_was_seen():
+    # Known before: free, then a wall two cells thick, then nothing.
+    known = np.array([[1, 1, 2, 2, 0]] * 3, np.int8)
+    walls = np.zeros((3, 5), bool)
+    walls[:, 2] = True
+    np.testing.assert_array_equal(with_walls(known, walls), [[1, 1, 2, 0, 0]] * 3)
+    walls = np.roll(walls, 1, axis=1)
+    np.testing.assert_array_equal(with_walls(known, walls), [[1, 1, 1, 2, 0]] * 3)
+
+
+def test_finer_layers_show_the_walls_that_the_map_has():
+    values = submap().grid.values
+    got = received(Layer.FINE).submap("auv_1").grid
+    is_wall = resample(got, submap().grid.spec) > 50
+    assert np.mean(is_wall[values > 50]) > 0.95
+    assert np.mean(values[is_wall] > 50) > 0.95
+
+
 def test_a_pose_that_moved_costs_an_outline_and_no_cells():
     moved = submap(revision=3, T_odom_submap=SE2(5.0, 6.0, 0.5))
     held = received(Layer.MEDIUM)
@@ -146,8 +165,9 @@ def test_the_path_is_where_it_was(rng):
     truth, is_known = interpolate_poses((stamps_ns, path), got.trajectory_stamp_ns)
     assert is_known.sum() > 55  # each second
     off = (got.trajectory - truth)[is_known]
-    assert np.abs(off[:, :2]).max() < 0.25
-    assert np.abs((off[:, 2] + np.pi) % (2 * np.pi) - np.pi).max() < 0.2
+    assert np.abs(off[:, :2]).max() < 0.15
+    assert np.sqrt(np.mean(off[:, :2] ** 2)) < 0.04
+    assert np.abs((off[:, 2] + np.pi) % (2 * np.pi) - np.pi).max() < 0.15
 
 
 def test_a_vehicle_that_never_moved_has_a_path_too():
@@ -224,7 +244,7 @@ def test_noise_is_refused(data):
 
 def test_another_version_is_refused():
     other = bytes([LAYERS[Layer.COARSE][0] + 4]) + LAYERS[Layer.COARSE][1:]
-    with pytest.raises(InvalidInputError, match="version of the codec is 2, expected 1"):
+    with pytest.raises(InvalidInputError, match="version of the codec is 3, expected 2"):
         LayeredSubmap().add(other)
 
 

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 
-__all__ = ["CELL_FREE", "CELL_UNKNOWN", "CELL_WALL", "decode_cells", "encode_cells"]
+__all__ = [
+    "CELL_FREE",
+    "CELL_UNKNOWN",
+    "CELL_WALL",
+    "decode_cells",
+    "decode_walls",
+    "encode_cells",
+    "encode_walls",
+]
 
 CellArray = NDArray[np.int8]
 
@@ -54,16 +62,34 @@ def _tables() -> tuple[NDArray[np.int64], ...]:
 
 def encode_cells(cells: CellArray, coarse: CellArray) -> bytes:
     """Encode cells (R, C); `coarse` (R, C) is what the receiver has of each of them already."""
-    buffer = np.zeros(4 * cells.size + 16, np.uint8)  # no bit costs more than 16
-    _check(cells, coarse)
-    num_bytes = _code(
-        np.array(cells, np.int8), np.ascontiguousarray(coarse), buffer, False, *_tables()
-    )
-    return bytes(buffer[:num_bytes]).rstrip(b"\0")
+    return _encoded(cells, coarse, 2)
 
 
 def decode_cells(data: bytes, coarse: CellArray) -> CellArray:
     """Decode what `encode_cells` made with the same `coarse`; of other bytes come other cells."""
+    return _decoded(data, coarse, 2)
+
+
+def encode_walls(walls: NDArray[np.bool_], coarse: CellArray) -> bytes:
+    """Encode which cells (R, C) are walls; `coarse` as for `encode_cells`."""
+    return _encoded(walls.astype(np.int8), coarse, 1)
+
+
+def decode_walls(data: bytes, coarse: CellArray) -> NDArray[np.bool_]:
+    """Decode what `encode_walls` made with the same `coarse`."""
+    return _decoded(data, coarse, 1) > 0
+
+
+def _encoded(cells: CellArray, coarse: CellArray, num_bits: int) -> bytes:
+    buffer = np.zeros(4 * cells.size + 16, np.uint8)  # no bit costs more than 16
+    _check(cells, coarse)
+    num_bytes = _code(
+        np.array(cells, np.int8), np.ascontiguousarray(coarse), buffer, False, num_bits, *_tables()
+    )
+    return bytes(buffer[:num_bytes]).rstrip(b"\0")
+
+
+def _decoded(data: bytes, coarse: CellArray, num_bits: int) -> CellArray:
     cells = np.zeros(coarse.shape, np.int8)
     _check(cells, coarse)
     _code(
@@ -71,6 +97,7 @@ def decode_cells(data: bytes, coarse: CellArray) -> CellArray:
         np.ascontiguousarray(coarse),
         np.frombuffer(bytearray(data), np.uint8),
         True,
+        num_bits,
         *_tables(),
     )
     return cells
@@ -143,15 +170,17 @@ def _learn(probabilities, counts, place, bit, rate):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True)
 def _code(  # type: ignore[no-untyped-def]
-    cells, coarse, buffer, is_decoding, starts, stretch, squash, rate
+    cells, coarse, buffer, is_decoding, num_bits, starts, stretch, squash, rate
 ):  # fmt: skip
-    """Encode cells (R, C) into the buffer, or decode them from it; returns the bytes used."""
+    """Encode cells (R, C) into the buffer, or decode them from it; returns the bytes used.
+
+    Each takes up to `num_bits` bits: whether it is more than 0, then whether it is more than 1.
+    """
     limit = squash.shape[0] // 2
     models = starts.shape[0] - 1
     size = starts[models]
-    # For each of the two bits of a cell: known or not, then a wall or not.
-    probabilities = np.full(2 * size, 32768, np.int32)
-    counts = np.zeros(2 * size, np.uint8)
+    probabilities = np.full(num_bits * size, 32768, np.int32)
+    counts = np.zeros(num_bits * size, np.uint8)
     plain = np.full(18, 32768, np.int32)
     plain_counts = np.zeros(18, np.uint8)
     weights = np.full((2, models, _NUM_SURE), _FIRST_WEIGHT, np.int64)
@@ -168,7 +197,7 @@ def _code(  # type: ignore[no-untyped-def]
             alike = _contexts(cells, coarse, row, col, context)
             value = int(cells[row, col])
             decoded = 0
-            for step in range(2):
+            for step in range(num_bits):
                 if alike >= 0:
                     chance = max(1, int(plain[step * 9 + alike]))
                 else:

@@ -8,16 +8,22 @@ from numba import njit
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
-from uw_dslam_ros2.core.link.coding.cell_coder import CELL_FREE, CELL_WALL, CellArray
+from uw_dslam_ros2.core.link.coding.cell_coder import (
+    CELL_FREE,
+    CELL_UNKNOWN,
+    CELL_WALL,
+    CellArray,
+)
 from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["known_window", "levelled", "occupancy_of", "reduce_cells", "spread"]
+__all__ = ["known_window", "levelled", "occupancy_of", "reduce_cells", "spread", "with_walls"]
 
 # As sure as a mapper is of a cell that it saw often.
 _FREE_PERCENT, _WALL_PERCENT = 5, 95
 _WALL_MIN_PERCENT = 60
 _FREE_MAX_PERCENT = 40
+_MAX_BARE_CELLS = 3  # from a coarse wall's side to the true wall
 _MIN_WALL_CELLS = 3
 """Walls that touch each other; fewer are a speck."""
 
@@ -108,6 +114,27 @@ def spread(
     picked = coarse[np.ix_(rows[rows < coarse.shape[0]], cols[cols < coarse.shape[1]])]
     wide[inside] = picked
     return wide
+
+
+def with_walls(known: CellArray, walls: NDArray[np.bool_]) -> CellArray:
+    """Cells whose walls are told exactly; the rest is as it was `known` before, coarsely.
+
+    Of what was a wall and is none any more, that is free which free cells beside it reach; the far
+    side of the wall is unknown.
+    """
+    is_bare = (known == CELL_WALL) & ~walls
+    free = (known == CELL_FREE) & ~walls
+    for _ in range(_MAX_BARE_CELLS):
+        beside = np.zeros_like(free)
+        beside[1:] |= free[:-1]
+        beside[:-1] |= free[1:]
+        beside[:, 1:] |= free[:, :-1]
+        beside[:, :-1] |= free[:, 1:]
+        free |= beside & is_bare
+    cells = np.full(known.shape, CELL_UNKNOWN, np.int8)
+    cells[free] = CELL_FREE
+    cells[walls] = CELL_WALL
+    return cells
 
 
 def occupancy_of(cells: CellArray, resolution_m: float, x: float, y: float) -> OccupancyMap:

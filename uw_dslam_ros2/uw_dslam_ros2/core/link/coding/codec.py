@@ -1,4 +1,4 @@
-"""A submap in layers, each of which says more: outline, cells of 0.3 m, of 0.2 m, of 0.1 m.
+"""A submap in layers, each of which says more: outline, cells of 0.3 m, walls of 0.2 m, of 0.1 m.
 
 Every layer decodes with those before it, and with nothing else. The receiver's submap is an
 ordinary one whose cells are those of the finest layer that it has, so that whoever has the same
@@ -14,13 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.link.coding.cell_coder import CellArray, decode_cells, encode_cells
+from uw_dslam_ros2.core.link.coding.cell_coder import (
+    CELL_WALL,
+    CellArray,
+    decode_cells,
+    decode_walls,
+    encode_cells,
+    encode_walls,
+)
 from uw_dslam_ros2.core.link.coding.cells import (
     known_window,
     levelled,
     occupancy_of,
     reduce_cells,
     spread,
+    with_walls,
 )
 from uw_dslam_ros2.core.link.coding.fields import ByteReader, ByteWriter, digest_of
 from uw_dslam_ros2.core.link.coding.outline import Outline, shape_of_cells
@@ -37,7 +45,7 @@ __all__ = [
     "write_outline",
 ]
 
-CODEC_VERSION = 1
+CODEC_VERSION = 2
 """Of layers; others are refused."""
 _UNIT_M = 1e-4  # of cell sizes
 _CORNER_M = 1e-3
@@ -56,9 +64,9 @@ class Layer(enum.IntEnum):
     COARSE = 1
     """Cells of 0.3 m, and the path."""
     MEDIUM = 2
-    """Cells of 0.2 m."""
+    """Where the walls are in cells of 0.2 m; what is free is told no better than before."""
     FINE = 3
-    """Cells of 0.1 m."""
+    """The same in cells of 0.1 m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -335,9 +343,10 @@ def _write_finer(
     below: CellLayer, layer: Layer, cells: CellArray, key: bytes
 ) -> tuple[bytes, CellLayer]:
     known = spread(below.cells, _FACTORS[below.layer], cells.shape, _FACTORS[layer])
-    found = _refined(below, layer, cells, key)
+    walls = cells == CELL_WALL
+    found = _refined(below, layer, with_walls(known, walls), key)
     writer = _begun(layer)
-    writer.raw(found.tag + encode_cells(cells, known))
+    writer.raw(found.tag + encode_walls(walls, known))
     return bytes(writer), found
 
 
@@ -349,8 +358,8 @@ def _read_finer(reader: ByteReader, below: CellLayer, layer: Layer, key: bytes) 
 def _decoded_finer(data: bytes, below: CellLayer, layer: Layer, key: bytes) -> CellLayer:
     old, new = _FACTORS[below.layer], _FACTORS[layer]
     shape = below.cells.shape[0] * old // new, below.cells.shape[1] * old // new
-    cells = decode_cells(data, spread(below.cells, old, shape, new))
-    return _refined(below, layer, cells, key)
+    known = spread(below.cells, old, shape, new)
+    return _refined(below, layer, with_walls(known, decode_walls(data, known)), key)
 
 
 def _refined(below: CellLayer, layer: Layer, cells: CellArray, key: bytes) -> CellLayer:
