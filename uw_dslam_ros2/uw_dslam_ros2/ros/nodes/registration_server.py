@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
 from uw_dslam_msgs.action import RegisterMaps as RegisterMapsAction
 from uw_dslam_msgs.srv import RegisterMaps, RegisterPointSets
 
@@ -35,9 +34,9 @@ from uw_dslam_ros2.core.registration import (
 from uw_dslam_ros2.core.registration.result import Progress, RegistrationResult, Verdict
 from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, transform2d_to_msg
 from uw_dslam_ros2.ros.convert.registration import options_from_msg, registration_to_msg
-from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
+from uw_dslam_ros2.ros.plumbing.diagnostics import Report
+from uw_dslam_ros2.ros.plumbing.managed_node import ManagedNode
 from uw_dslam_ros2.ros.plumbing.node_settings import RegistrationServerConfig
-from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 from uw_dslam_ros2.ros.plumbing.registration_jobs import Job, RegistrationJobs, Search
 from uw_dslam_ros2.ros.plumbing.running import run_node
@@ -51,16 +50,28 @@ _NUM_LATENCIES = 200
 _SWITCH_INTERVAL_S = 2e-4
 
 
-class RegistrationServer(Node):
-    """Services ``~/register_maps`` and ``~/register_point_sets``, action ``~/register_maps``."""
+class RegistrationServer(ManagedNode):
+    """Services ``~/register_maps`` and ``~/register_point_sets``, action ``~/register_maps``.
+
+    While it is not active, who asks is told that it is busy.
+    """
+
+    groups = (
+        ("", RegistrationServerConfig),
+        ("registration", GridRegistrationConfig),
+        ("points", RegistrationConfig),
+    )
+    live = frozenset({"max_cells", "max_points", "registration.*", "points.*"})
+    why_fixed = "its threads are started with it"
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("registration_server", **kwargs)
-        self._config = declare_config(self, RegistrationServerConfig)
-        self._grid_config = declare_config(self, GridRegistrationConfig, "registration")
-        self._point_config = declare_config(self, RegistrationConfig, "points")
-        refuse_unknown_parameters(self)
+
+    def set_up(self) -> None:
+        """Make threads, services and the action."""
+        self._config = self.settings(RegistrationServerConfig)
         self._jobs = RegistrationJobs(self._config.max_parallel, self._config.max_waiting)
+        self.at_end(self._jobs.close)  # whoever waits for a search gets an answer
         self.num_threads = self._jobs.max_accepted + 4
         self._statistics = _Statistics()
         group = ReentrantCallbackGroup()
@@ -76,26 +87,25 @@ class RegistrationServer(Node):
             RegisterMapsAction,
             "~/register_maps",
             self._execute,
+            goal_callback=lambda _: GoalResponse.ACCEPT if self.is_active else GoalResponse.REJECT,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             callback_group=group,
             goal_service_qos_profile=SERVICES,
             result_service_qos_profile=SERVICES,
             cancel_service_qos_profile=SERVICES,
         )
+        self.at_end(self._action.destroy)
         # New with every start: whoever waits for an answer sees that its server is gone.
         instance = f"{socket.gethostname()}:{os.getpid()}:{time.time_ns()}"
-        self._diagnostics = Diagnostics(self, self._report, instance)
+        self.tell_health(self._report, instance)
+
+    def begin(self) -> None:
+        """Take requests."""
         self.get_logger().info(f"serving, {self._jobs.max_parallel} searches at a time")
 
-    def stop(self) -> None:
-        """Stop the searches, so that whoever waits for them gets an answer."""
-        self._jobs.close()
-
-    def destroy_node(self) -> None:
-        """Stop, then destroy."""
-        self.stop()
-        self._action.destroy()
-        super().destroy_node()
+    def settings_changed(self) -> None:
+        """From the next request on."""
+        self._config = self.settings(RegistrationServerConfig)
 
     # --- services ----------------------------------------------------------------------------
 
@@ -118,6 +128,10 @@ class RegistrationServer(Node):
 
     def _begin(self, make_search: Any, response: Any) -> Job | None:
         """Begin what a request asks for; None where it is refused, as the response then says."""
+        if not self.is_active:
+            response.result, response.message = response.BUSY, "the server is not active"
+            self._statistics.count("busy")
+            return None
         try:
             search: Search = make_search()
         except InvalidInputError as error:
@@ -162,7 +176,7 @@ class RegistrationServer(Node):
         source = self._map_of(request.source, "source")
         target = self._map_of(request.target, "target")
         prior, max_seconds = options_from_msg(request.options)
-        config = adapted(self._grid_config, max_seconds)
+        config = adapted(self.settings(GridRegistrationConfig), max_seconds)
         return functools.partial(
             register_grids, source, target, config, prior=prior, clock=time.monotonic
         )
@@ -187,7 +201,7 @@ class RegistrationServer(Node):
             )
         if request.sigma_m > 0.0:
             given["sigma"] = float(request.sigma_m)
-        config = adapted(self._point_config, max_seconds, **given)
+        config = adapted(self.settings(RegistrationConfig), max_seconds, **given)
         return functools.partial(
             register_point_sets, source, target, config, prior=prior, clock=time.monotonic
         )

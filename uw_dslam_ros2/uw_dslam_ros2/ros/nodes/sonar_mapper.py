@@ -6,53 +6,35 @@ import functools
 import secrets
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from rclpy.subscription import Subscription
-from std_srvs.srv import Trigger
-from uw_dslam_msgs.msg import Submap as SubmapMsg
+from std_srvs.srv import SetBool, Trigger
 from uw_dslam_msgs.srv import GetSubmap
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
 from uw_dslam_ros2.core.mapping import RunBreak, VehicleMapper, VehicleMapperConfig, VehicleRuns
-from uw_dslam_ros2.core.pose_graph import compose_covariance
-from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap, SubmapId
+from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
 from uw_dslam_ros2.io.conventions import correct, correct_mounting
 from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed_runs
 from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.readings import PINGS, TransformEvent
-from uw_dslam_ros2.ros.convert.core_types import (
-    occupancy_to_msg,
-    odometry_to_msg,
-    path_to_msg,
-    stamp_to_msg,
-    submap_to_msg,
-)
-from uw_dslam_ros2.ros.plumbing.batched_subscription import subscribe_batched
+from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
 from uw_dslam_ros2.ros.plumbing.convention_watch import ConventionWatch
-from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
-from uw_dslam_ros2.ros.plumbing.frames import (
-    WARNING_PERIOD_S,
-    FrameBroadcaster,
-    Transforms,
-    transform_to_msg,
-)
+from uw_dslam_ros2.ros.plumbing.diagnostics import Report
+from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, Transforms
+from uw_dslam_ros2.ros.plumbing.managed_node import ManagedNode
+from uw_dslam_ros2.ros.plumbing.mapper_outputs import MapperOutputs
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
-from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
-from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SERVICES, SUBMAPS, sensor_qos
+from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 from uw_dslam_ros2.ros.plumbing.running import run_node
-from uw_dslam_ros2.ros.plumbing.sensor_inputs import SensorInput, default_inputs, found_inputs
+from uw_dslam_ros2.ros.plumbing.sensor_inputs import SensorInput
+from uw_dslam_ros2.ros.plumbing.sensor_silence import SensorSilence
+from uw_dslam_ros2.ros.plumbing.sensor_topics import SensorTopics
 from uw_dslam_ros2.ros.plumbing.stamp_order import StampOrder
 from uw_dslam_ros2.ros.plumbing.throttle import Throttle
 from uw_dslam_ros2.ros.plumbing.worker import Worker
@@ -61,24 +43,29 @@ __all__ = ["SonarMapper", "SonarMapperConfig", "main"]
 
 _JUMP_BACK_S = 1.0  # stamps that go back by more are late, or show a clock that was set
 _MANY_DISPLACED = 50
-_PATH_MAX_POSES = 2000  # a longer path is thinned when published
 _MAX_AHEAD_NS = 10_000_000_000
 _MOUNT_PATIENCE_NS = 5_000_000_000
 _ODOM_PERIOD_NS = 100_000_000
 _FINISH_TIMEOUT_S = 600.0
-_SILENT_S, _LOST_S = 5.0, 30.0  # a sensor's silence that is a warning, and an error
-_USUAL_PERIODS = 5.0
+_LAST_WORD_S, _HEARD_S, _CLOSE_S = 1.0, 0.3, 5.0
+"""When told to end: to close the open submap, until who listens has it, for the job at hand."""
 _IDLE_S = 4.0  # longer than the repair of a lost message takes
 
 
-class SonarMapper(Node):
+class SonarMapper(ManagedNode):
     """Drives a `VehicleMapper`; all topics are relative, so that a namespace makes a vehicle."""
+
+    groups = (("", SonarMapperConfig), ("mapper", VehicleMapperConfig))
+    live = frozenset({"map_period_s"})
+    why_fixed = "what is mapped so far was mapped with it"
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("sonar_mapper", **kwargs)
-        self._config = declare_config(self, SonarMapperConfig)
-        self._mapper_config = declare_config(self, VehicleMapperConfig, "mapper")
-        refuse_unknown_parameters(self)
+
+    def set_up(self) -> None:
+        """Begin with an empty map."""
+        self._config = self.settings(SonarMapperConfig)
+        self._mapper_config = self.settings(VehicleMapperConfig)
         self._vehicle_id = self._config.vehicle_id or self.get_namespace().strip("/")
         if not self._vehicle_id:
             raise ConfigError(
@@ -86,11 +73,6 @@ class SonarMapper(Node):
                 "give one of them (-r __ns:=/auv_1)"
             )
         self._base_frame = self._config.base_frame or f"{self._vehicle_id}/base_link"
-        self._map_frame = self._config.map_frame or f"{self._vehicle_id}/map"
-        self._odom_frame = self._config.odom_frame or f"{self._vehicle_id}/odom"
-        self._T_odom_base = self._T_odom_run = SE2()
-        self._smooth_mapper: VehicleMapper | None = None
-        self._sent: set[SubmapId] = set()
         self._runs = VehicleRuns(self._mapper_config, self._vehicle_id, _draw_run_id)
         self._order: StampOrder[SensorEvent] = StampOrder(
             int(self._reorder_s() * 1e9),
@@ -99,19 +81,23 @@ class SonarMapper(Node):
         )
         self._counts: Counter[str] = Counter()
         self._mapper_values: dict[str, float | int | str] = {}
-        self._last_problem = self._problem = ""
+        self._last_problem = self._problem_of_topics = ""
         self._odom_stamp_ns = 0
         self._map_stamp_ns = 0
         self._drawing = Throttle(self._config.map_period_s)
-        self._is_finished = False
+        self._is_finished = self._is_paused = False
         self._num_breaks_told = 0
-        self._heard_s = time.monotonic()
+        self._silence = SensorSilence(time.monotonic())
+        self._topics: SensorTopics | None = None
         self._worker = Worker("mapper", self._on_worker_error)
+        self.at_end(lambda: self._worker.close(_CLOSE_S))
         self._watch = ConventionWatch(
             self._mapper_config.sonar, self._vehicle_id, self._on_convention, self._on_worker_error
         )
-        self._create_publishers()
-        group = MutuallyExclusiveCallbackGroup()
+        self.at_end(self._watch.close)
+        self._outputs = MapperOutputs(self, self._config, self._vehicle_id, self._base_frame)
+        self.at_end(self._say_last)
+        self._group = MutuallyExclusiveCallbackGroup()
         self._mountings = Mountings(self._base_frame)
         self._mounting_problem = ""
         self._told: set[str] = set()
@@ -119,41 +105,61 @@ class SonarMapper(Node):
             self,
             self._vehicle_id,
             lambda event: self._worker.post(functools.partial(self._mount, event)),
-            callback_group=group,
+            callback_group=self._group,
         )
-        self._group = group
-        self._inputs: dict[str, SensorInput] = {}
-        self._subscriptions_of: dict[str, Subscription] = {}
-        self._heard: dict[str, _Heard] = {}
-        for sensor in default_inputs(self._config, self._vehicle_id, self._on_finding):
-            self._subscribe(sensor)
-        self.create_service(
-            Trigger, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup()
+        services = ReentrantCallbackGroup()
+        for service_type, name, serve in (
+            (Trigger, "~/finish", self._on_finish),
+            (Trigger, "~/reset", self._on_reset),
+            (SetBool, "~/pause", self._on_pause),
+            (GetSubmap, "~/get_submap", self._on_get_submap),
+        ):
+            self.create_service(
+                service_type, name, serve, qos_profile=SERVICES, callback_group=services
+            )
+        self.tell_health(self._report, self._vehicle_id)
+
+    def begin(self) -> None:
+        """Listen to the sensors."""
+        self._silence = SensorSilence(time.monotonic())
+        self._topics = SensorTopics(
+            self,
+            self._config,
+            self._vehicle_id,
+            self._on_message,
+            self._on_finding,
+            MapperOutputs.TOPICS,
+            self._group,
         )
-        self.create_service(
-            GetSubmap,
-            "~/get_submap",
-            self._on_get_submap,
-            qos_profile=SERVICES,
-            callback_group=ReentrantCallbackGroup(),
-        )
-        self._diagnostics = Diagnostics(self, self._report, self._vehicle_id)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self._on_idle_timer, clock=steady, callback_group=group)
-        self.create_timer(1.0, self._on_discovery_timer, clock=steady, callback_group=group)
+        self.create_timer(1.0, self._on_idle_timer, clock=steady, callback_group=self._group)
+        self.create_timer(1.0, self._on_discovery_timer, clock=steady, callback_group=self._group)
         self.get_logger().info(
             f"mapping {self._vehicle_id} from {self._config.input}, body frame {self._base_frame}"
         )
 
-    def stop(self) -> None:
-        """End the worker after the job at hand."""
-        self._worker.close(timeout_s=5.0)
-        self._watch.close()
+    def rest(self) -> None:
+        """Listen no more; a heading that is missing for long begins a new run."""
+        if self._topics is not None:
+            self._topics.stop()
 
-    def destroy_node(self) -> None:
-        """Stop, then destroy."""
-        self.stop()
-        super().destroy_node()
+    def _say_last(self) -> None:
+        """Give the open submap away, if there is time."""
+        if not self._mapper.num_pings or self._is_finished:
+            return
+        job = self._worker.call(self._finish)
+        try:
+            job.result(_LAST_WORD_S)
+        except Exception as error:  # noqa: BLE001 (it ends in any case)
+            job.cancel()
+            self.get_logger().warning(f"the open submap is lost: {error or type(error).__name__}")
+        else:
+            self._outputs.wait_for_readers(_HEARD_S)
+
+    def settings_changed(self) -> None:
+        """From the next map on."""
+        self._config = self.settings(SonarMapperConfig)
+        self._drawing = Throttle(self._config.map_period_s)
 
     @property
     def _mapper(self) -> VehicleMapper:
@@ -165,59 +171,19 @@ class SonarMapper(Node):
         live_s, replay_s = 1.0, 60.0
         return self._config.reorder_s or (replay_s if self._config.is_reliable else live_s)
 
-    def _create_publishers(self) -> None:
-        self._submap_pub = self.create_publisher(SubmapMsg, "submap", SUBMAPS)
-        self._map_pub = self.create_publisher(OccupancyGrid, "map", LATCHED)
-        self._path_pub = self.create_publisher(Path, "path", LATCHED)
-        self._odom_pub = self.create_publisher(Odometry, "odom", DEFAULT)
-        self._broadcaster = FrameBroadcaster(self) if self._config.publishes_tf else None
-
-    def _subscribe(self, sensor: SensorInput) -> None:
-        """Listen to a topic, and no more to the one that had its role before."""
-        msg_type = sensor.msg_type
-        if old := self._subscriptions_of.pop(sensor.role, None):
-            self.destroy_subscription(old)
-        self._inputs[sensor.role] = sensor
-        qos = sensor_qos(sensor.queue_depth, is_reliable=self._config.is_reliable)
-        take = functools.partial(self._on_message, sensor)
-        self._subscriptions_of[sensor.role] = subscribe_batched(
-            self, msg_type, sensor.topic, take, qos, self._group
-        )
-
     def _on_discovery_timer(self) -> None:
-        """Find sensors whose topics have other names or types than the usual ones."""
-        own = {self.resolve_topic_name(name) for name in ("odom", "map", "path", "submap")}
-        namespace = self.get_namespace().strip("/")
-        wanted = self._config.topics.chosen().values()
-        table = {}
-        for topic, _ in self.get_topic_names_and_types():
-            is_mine = not namespace or topic.startswith(f"/{namespace}/") or topic in wanted
-            senders = self.get_publishers_info_by_topic(topic) if is_mine else []
-            if senders and topic not in own:
-                table[topic] = senders[0].topic_type
+        if self._topics is None or not self.is_active:
+            return
         try:
-            found = found_inputs(
-                self._config, self._vehicle_id, namespace, table, self._on_finding
-            )
-            for sensor in found:
-                if not self._is_sent(self._inputs.get(sensor.role)):
-                    self._subscribe(sensor)
-                    self.get_logger().info(f"{sensor.name} is {sensor.topic} ({sensor.msgtype})")
+            self._topics.discover()
         except DataError as error:
             # A topic that is set may still come.
             is_waiting = "no topic" in str(error)
-            self._problem = self._problem if is_waiting else str(error)
-
-    def _is_sent(self, sensor: SensorInput | None) -> bool:
-        """Whether somebody sends what is listened to."""
-        if sensor is None:
-            return False
-        senders = self.get_publishers_info_by_topic(self.resolve_topic_name(sensor.topic))
-        return any(info.topic_type == sensor.msgtype for info in senders)
+            self._problem_of_topics = self._problem_of_topics if is_waiting else str(error)
 
     def _on_finding(self, finding: Finding) -> None:
         if finding.severity != "info":
-            self._problem = finding.sentence
+            self._problem_of_topics = finding.sentence
             self.get_logger().warning(finding.sentence, throttle_duration_sec=WARNING_PERIOD_S)
 
     def _on_convention(self, finding: Finding) -> None:
@@ -226,10 +192,11 @@ class SonarMapper(Node):
     # --- messages to events ------------------------------------------------------------------
 
     def _on_message(self, sensor: SensorInput, msg: Any) -> None:
+        if not self.is_active:
+            return
         name = sensor.name
         self._counts[f"num_{name}"] += 1
-        self._heard_s = time.monotonic()
-        self._heard.setdefault(name, _Heard(self._heard_s)).hear(self._heard_s)
+        self._silence.hear(name, time.monotonic())
         now_ns = self.get_clock().now().nanoseconds
         try:
             self._check_stamp(msg)
@@ -243,6 +210,9 @@ class SonarMapper(Node):
         stamp_ns = stamp_of(msg) or now_ns
         usual = [correct(event, self._config.conventions) for event in said]
         events = [event for event in usual if event is not None]
+        if sensor.role == "sonar" and self._is_paused:
+            self._counts["num_pings_paused"] += len(events)
+            events = []
         if not events:
             self._counts["num_no_velocity"] += sensor.role == "velocity"
             self._worker.post(functools.partial(self._take, name, stamp_ns, None))
@@ -292,7 +262,7 @@ class SonarMapper(Node):
 
     def _expect_streams(self, stamp_ns: int) -> None:
         """At the start, wait for the first message of every sensor that somebody sends."""
-        for sensor in list(self._inputs.values()):
+        for sensor in self._topics.inputs() if self._topics is not None else ():
             if self.count_publishers(sensor.topic):
                 self._order.expect(sensor.name, stamp_ns - 1)  # its own may be of the same moment
 
@@ -307,15 +277,17 @@ class SonarMapper(Node):
             f"the clock went {way} by {abs(stamp_ns - newest_ns) * 1e-9:.1f} s (on {stream}): a "
             "new run begins; what was mapped before is kept, and only registration joins the two"
         )
-        reason = RunBreak("", newest_ns, stamp_ns)
-        self._publish_submaps(self._runs.begin(reason))
+        self._begin_run(RunBreak("", newest_ns, stamp_ns))
+
+    def _begin_run(self, reason: RunBreak) -> None:
+        self._outputs.publish_submaps(self._runs.begin(reason))
         self._odom_stamp_ns = self._map_stamp_ns = 0
         self._is_finished = False
         self._counts["num_restarts"] += 1
 
     def _on_idle_timer(self) -> None:
         """When nothing comes any more, what was held back for others is used all the same."""
-        if time.monotonic() - self._heard_s > _IDLE_S:
+        if time.monotonic() - self._silence.last_s > _IDLE_S:
             self._worker.post(self._flush)
 
     def _flush(self) -> None:
@@ -358,13 +330,14 @@ class SonarMapper(Node):
         except InvalidInputError as error:
             self._complain(f"{type(event).__name__} of {event.frame_id}: {error}")
             return
-        self._publish_submaps(submaps)
+        self._outputs.publish_submaps(submaps)
         self._note_breaks()
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is None:
             return
         if stamp_ns - self._odom_stamp_ns >= _ODOM_PERIOD_NS:
-            self._publish_odometry(stamp_ns)
+            self._odom_stamp_ns = stamp_ns
+            self._outputs.publish_odometry(self._mapper, stamp_ns)
         if isinstance(event, PINGS):
             self._mapper_values = self._runs.diagnostics()
             is_old = stamp_ns - self._map_stamp_ns >= self._config.map_period_s * 1e9
@@ -384,12 +357,18 @@ class SonarMapper(Node):
                 self.get_logger().warning(self._last_problem)
         self._num_breaks_told = len(self._runs.breaks)
 
+    def _reset(self) -> str:
+        """Begin anew; what was mapped before goes to who listens, and stays there."""
+        stamp_ns = self._mapper.stamp_ns or 0
+        self._begin_run(RunBreak("", stamp_ns, stamp_ns))
+        return f"a new run begins; {self._runs.diagnostics()['num_submaps']} submaps lie before it"
+
     def _finish(self) -> str:
         if self._is_finished:
             return "finished before; nothing changes"
         self._flush()
         submaps = self._runs.finish()
-        self._publish_submaps(submaps)
+        self._outputs.publish_submaps(submaps)
         self._is_finished = True
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is not None:
@@ -400,69 +379,36 @@ class SonarMapper(Node):
             f"{self._mapper_values['num_submaps']} submaps; {self._counts['num_bad']} bad messages"
         )
 
-    def _publish_submaps(self, submaps: Iterable[Submap]) -> None:
-        for submap in submaps:
-            self._counts["num_submap_messages"] += 1
-            # What is closed moves, and changes no more: a grid is a megabyte.
-            is_known = submap.submap_id in self._sent
-            self._counts["num_pose_messages"] += is_known
-            self._submap_pub.publish(submap_to_msg(submap, is_pose_only=is_known))
-            self._sent.add(submap.submap_id)
-
-    def _publish_odometry(self, stamp_ns: int) -> None:
-        self._odom_stamp_ns = stamp_ns
-        stamp = stamp_to_msg(stamp_ns)
-        mapper = self._mapper
-        if self._smooth_mapper is not mapper:
-            # A new run begins at its own zero; odometry goes on from where it was.
-            self._T_odom_run = self._T_odom_base @ mapper.T_smooth_base.inverse()
-            self._smooth_mapper = mapper
-        self._T_odom_base = self._T_odom_run @ mapper.T_smooth_base
-        msg = odometry_to_msg(
-            self._T_odom_base,
-            _turned(mapper.smooth_covariance, self._T_odom_run),
-            *mapper.velocity,
-            mapper.velocity_covariance,
-            mapper.depth_m,
-        )
-        msg.header.stamp = stamp
-        msg.header.frame_id, msg.child_frame_id = self._odom_frame, self._base_frame
-        self._odom_pub.publish(msg)
-        if self._broadcaster is not None:
-            # Loop closures, and where a new run lies, move the frame and not the odometry.
-            T_map_odom = mapper.T_odom_base @ self._T_odom_base.inverse()
-            T_odom_base = transform_to_msg(
-                stamp, self._odom_frame, self._base_frame, self._T_odom_base
-            )
-            T_odom_base.transform.translation.z = msg.pose.pose.position.z
-            self._broadcaster.send(
-                transform_to_msg(stamp, self._map_frame, self._odom_frame, T_map_odom),
-                T_odom_base,
-            )
-
     def _publish_map(self, stamp_ns: int) -> None:
         self._map_stamp_ns = stamp_ns
-        stamps_ns, poses = self._mapper.trajectory()
-        if not len(poses):
-            return
-        frame_id = self._map_frame
         with self._drawing.turn():
-            occupancy = self._mapper.vehicle_map()
-            self._map_pub.publish(occupancy_to_msg(occupancy, frame_id, stamp_ns))
-            self._path_pub.publish(
-                path_to_msg(stamps_ns, poses, frame_id, stamp_ns, _PATH_MAX_POSES)
-            )
+            self._outputs.publish_map(self._mapper, stamp_ns)
 
     # --- services and diagnostics ------------------------------------------------------------
 
     def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._served("finish", self._finish, response)
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._served("reset", self._reset, response)
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        # By arrival: what came before is mapped. Navigation goes on, so that the run does.
+        self._is_paused = bool(request.data)
+        response.success = True
+        response.message = "pings are left out" if request.data else "pings are mapped"
+        self.get_logger().info(response.message)
+        return response
+
+    def _served(self, name: str, job: Callable[[], str], response: Any) -> Any:
+        """Answer a request with what a job in the worker's thread says."""
         try:
-            response.message = self._worker.call(self._finish).result(_FINISH_TIMEOUT_S)
+            response.message = self._worker.call(job).result(_FINISH_TIMEOUT_S)
             response.success = True
         except Exception as error:  # noqa: BLE001 (the caller gets it)
             response.success = False
             response.message = f"{type(error).__name__}: {error}"
-        self.get_logger().info(f"finish: {response.message}")
+        self.get_logger().info(f"{name}: {response.message}")
         return response
 
     def _on_get_submap(
@@ -486,71 +432,35 @@ class SonarMapper(Node):
         return self._runs.issued(int(request.run_id), int(request.sequence))
 
     def _report(self) -> Report:
-        for sensor in list(self._inputs.values()):
-            topic = self.resolve_topic_name(sensor.topic)
-            for info in self.get_publishers_info_by_topic(topic):
-                if info.topic_type != sensor.msgtype:
-                    self._complain(
-                        f"topic {topic} has type {info.topic_type}, expected {sensor.msgtype}"
-                    )
+        for misfit in self._topics.misfits() if self._topics is not None else ():
+            self._complain(misfit)
         values = {
-            **dict(sorted(self._counts.items())),
+            **dict(sorted((self._counts + self._outputs.counts).items())),
             "num_frames": self._mountings.num_frames,
             "num_late": self._order.num_late,
             "num_waiting": self._worker.num_waiting,
             **self._mapper_values,
         }
         num_pings = self._mapper_values.get("num_pings", 0)
-        problem = self._last_problem or self._problem or self._mounting_problem
-        severity, silence = self._silence()
+        problem = self._last_problem or self._problem_of_topics or self._mounting_problem
+        severity: Severity = "info"
+        silence = ""
+        if not self._is_finished:
+            severity, silence = self._silence.judge(time.monotonic())
         if conventions := self._watch.sentence:
             severity = max(severity, "warning", key=SEVERITIES.index)
             problem = conventions
+        if self._is_paused:
+            return severity, silence or f"paused; {num_pings} pings mapped", values
         if not num_pings:
             text = problem or "no ping mapped yet"
             return max(severity, "warning", key=SEVERITIES.index), silence or text, values
         return severity, silence or problem or f"{num_pings} pings mapped", values
 
-    def _silence(self) -> tuple[Severity, str]:
-        """How bad it is that sensors which were heard are heard no more, and which."""
-        if self._is_finished:
-            return "info", ""
-        now_s = time.monotonic()
-        ages = {name: heard.silence_s(now_s) for name, heard in list(self._heard.items())}
-        silent = {name: age_s for name, age_s in ages.items() if age_s > _SILENT_S}
-        if not silent:
-            return "info", ""
-        text = "; ".join(f"{name}: no message for {age_s:.0f} s" for name, age_s in silent.items())
-        return "error" if max(silent.values()) > _LOST_S else "warning", text
-
-
-def _turned(covariance: NDArray[np.float64], T_odom_run: SE2) -> NDArray[np.float64]:
-    """The covariance (3, 3) of a pose in the run's own frame, in odom."""
-    return compose_covariance(covariance, T_odom_run, SE2(), SE2())
-
 
 def _draw_run_id() -> int:
     """Different also for two mappers that start in the same moment."""
     return 1 + secrets.randbelow(MAX_RUN_ID)
-
-
-@dataclass(slots=True)
-class _Heard:
-    """When a sensor was heard, by a steady clock."""
-
-    first_s: float
-    last_s: float = 0.0
-    num: int = 0
-
-    def hear(self, now_s: float) -> None:
-        self.last_s = now_s
-        self.num += 1
-
-    def silence_s(self, now_s: float) -> float:
-        """Time since the last message; 0 as long as that is usual for this sensor."""
-        period_s = (self.last_s - self.first_s) / max(1, self.num - 1)
-        age_s = now_s - self.last_s
-        return age_s if age_s > _USUAL_PERIODS * period_s else 0.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -25,6 +25,10 @@ class IdleTimeout:
         self._last_s: float | None = None
         self._is_ended = True
 
+    def set_quiet(self, quiet_s: float) -> None:
+        """As at the beginning, from now on."""
+        self._quiet_s = quiet_s
+
     def note(self, now_s: float) -> None:
         """Something came."""
         if self._last_s is not None:

@@ -171,6 +171,13 @@ class MapInputs:
         one.is_rested = False
         self._on_change(one.topic, one.vehicle_id, change)
 
+    def stop(self) -> None:
+        """Listen no more, until `look` is called again."""
+        for one in self._inputs.values():
+            if one.subscription is not None:
+                self._node.destroy_subscription(one.subscription)
+                one.subscription = None
+
     def rest(self) -> None:
         """Tell what was held back because it was little."""
         for one in self._inputs.values():

@@ -34,6 +34,10 @@ class MapPublisher:
         self._update_pub = node.create_publisher(OccupancyGridUpdate, "map_updates", DEFAULT)
         self.clear()
 
+    def set_full_period(self, full_period_s: float) -> None:
+        """From now on."""
+        self._full_period_s = full_period_s
+
     def clear(self) -> None:
         """Forget what was sent: the next map goes out whole."""
         self._sent_spec: GridSpec | None = None

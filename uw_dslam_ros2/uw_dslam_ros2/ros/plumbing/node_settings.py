@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
@@ -21,10 +22,18 @@ __all__ = [
 ]
 
 
+def _autostart() -> Any:
+    return setting(
+        True,
+        doc="configure and activate at the start; else wait for the services of the life cycle",
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class SonarMapperConfig(SensorConfig):
     """Settings of the sonar mapper as a node; `mapper` holds those of the mapping itself."""
 
+    autostart: bool = _autostart()
     vehicle_id: str = setting("", doc="the vehicle's name; empty: the node's namespace")
     is_reliable: bool = setting(
         False,
@@ -53,6 +62,7 @@ class SonarMapperConfig(SensorConfig):
 class RegistrationServerConfig(Config):
     """Settings of the registration server."""
 
+    autostart: bool = _autostart()
     max_parallel: int = setting(
         0, 0, 256, "searches at a time; 0: as many as cores", is_basic=True
     )
@@ -67,6 +77,7 @@ class RegistrationServerConfig(Config):
 class MapQueueManagerConfig(Config):
     """Settings of the manager as a node; `queue` holds those of the map queue itself."""
 
+    autostart: bool = _autostart()
     vehicles: tuple[str, ...] = setting(
         (),
         doc="vehicles whose submaps are taken; empty: every topic of type Submap on the graph",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -20,11 +20,11 @@ from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.settings import REMOVED, SECTIONS
 from uw_dslam_ros2.ros.plumbing.node_settings import names_of_all_nodes
+from uw_dslam_ros2.ros.plumbing.qos_overrides import QOS_HEAD, QosOverrides, given_parameters
 
-__all__ = ["declare_config", "refuse_unknown_parameters", "settings_of"]
+__all__ = ["declare_config", "held_config", "refuse_unknown_parameters", "settings_of"]
 
 _OWN_TO_RCLPY = ("use_sim_time", "start_type_description_service")
-_QOS_HEAD = "qos_overrides"
 _TYPES = {
     bool: Parameter.Type.BOOL,
     int: Parameter.Type.INTEGER,
@@ -40,9 +40,11 @@ _ARRAY_TYPES = {
 
 
 def declare_config[ConfigT: Config](
-    node: Node, config_type: type[ConfigT], prefix: str = ""
+    node: Node, config_type: type[ConfigT], prefix: str = "", *, is_read_only: bool = True
 ) -> ConfigT:
     """Declare a parameter per field (dotted names for nested ones); build the settings of them.
+
+    Who declares them not read-only decides by a callback what may be set when.
 
     Raises
     ------
@@ -54,10 +56,38 @@ def declare_config[ConfigT: Config](
     for field in dataclasses.fields(config_type):
         name = f"{prefix}.{field.name}" if prefix else field.name
         if isinstance(field.default, Config):
-            values[field.name] = declare_config(node, type(field.default), name)
+            values[field.name] = declare_config(
+                node, type(field.default), name, is_read_only=is_read_only
+            )
         else:
-            values[field.name] = _declare(node, name, field, parameter_type(config_type, field))
+            kind = parameter_type(config_type, field)
+            values[field.name] = _declare(node, name, field, kind, is_read_only=is_read_only)
     return config_type(**values)  # __post_init__ checks again, choices included
+
+
+def held_config[ConfigT: Config](
+    node: Node,
+    config_type: type[ConfigT],
+    prefix: str = "",
+    given: Mapping[str, Any] | None = None,
+) -> ConfigT:
+    """Settings as a node's declared parameters are now, or would be with those given.
+
+    Raises
+    ------
+    ConfigError
+        If a value lies outside its range or is none of its choices.
+    """
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(config_type):
+        name = f"{prefix}.{field.name}" if prefix else field.name
+        if isinstance(field.default, Config):
+            values[field.name] = held_config(node, type(field.default), name, given)
+            continue
+        # An empty list has no value for rclpy, see `_declare`.
+        value = given[name] if given and name in given else node.get_parameter_or(name).value
+        values[field.name] = tuple(value or ()) if isinstance(field.default, tuple) else value
+    return config_type(**values)
 
 
 def parameter_type(config_type: type[Config], field: dataclasses.Field[Any]) -> Parameter.Type:
@@ -68,13 +98,20 @@ def parameter_type(config_type: type[Config], field: dataclasses.Field[Any]) -> 
     return _TYPES[type(field.default)]
 
 
-def _declare(node: Node, name: str, field: dataclasses.Field[Any], kind: Parameter.Type) -> Any:
+def _declare(
+    node: Node,
+    name: str,
+    field: dataclasses.Field[Any],
+    kind: Parameter.Type,
+    *,
+    is_read_only: bool,
+) -> Any:
     low: Any = field.metadata.get("low")
     high: Any = field.metadata.get("high")
     choices = field.metadata.get("choices")
     descriptor = ParameterDescriptor(
         description=field.metadata.get("doc", ""),
-        read_only=True,
+        read_only=is_read_only,
         additional_constraints=f"one of {', '.join(choices)}" if choices else "",
     )
     if kind == Parameter.Type.INTEGER and None not in (low, high):
@@ -89,15 +126,16 @@ def _declare(node: Node, name: str, field: dataclasses.Field[Any], kind: Paramet
     try:
         parameter = node.declare_parameter(name, kind if is_empty_array else default, descriptor)
     except InvalidParameterTypeException as error:
-        given = _given(node)[name].value
+        given = given_parameters(node)[name].value
         hint = f"; write {given}.0" if kind == Parameter.Type.DOUBLE and type(given) is int else ""
         raise ConfigError(
             f"parameter {name} is {given!r} ({type(given).__name__}), "
             f"expected {kind.name.lower()}{hint}"
         ) from error
     except InvalidParameterValueException as error:
+        value = given_parameters(node)[name].value
         raise ConfigError(
-            f"parameter {name} is {_given(node)[name].value!r}, expected {low} to {high}: "
+            f"parameter {name} is {value!r}, expected {low} to {high}: "
             f"{field.metadata.get('doc', '')}"
         ) from error
     value = () if parameter.type_ == Parameter.Type.NOT_SET else parameter.value
@@ -112,13 +150,16 @@ def refuse_unknown_parameters(node: Node) -> None:
     One file may hold the parameters of all nodes under ``/**``: a node skips the others'.
     """
     anothers = names_of_all_nodes()
+    can_override = isinstance(node, QosOverrides)
     own = {name.split(".")[0] for name in _declared(node)}
-    for name in sorted(_given(node)):
+    for name in sorted(given_parameters(node)):
         head = name.split(".")[0]
         is_anothers = name in anothers or (head in SECTIONS and head not in own)
         if node.has_parameter(name) or name in _OWN_TO_RCLPY or is_anothers:
             continue
-        if head == _QOS_HEAD:
+        if head == QOS_HEAD and can_override:
+            continue
+        if head == QOS_HEAD:
             raise ConfigError(
                 f"parameter {name} would change nothing: {node.get_name()} has the quality of "
                 "service that the documentation of its topics says"
@@ -130,13 +171,9 @@ def refuse_unknown_parameters(node: Node) -> None:
         )
 
 
-def _given(node: Node) -> dict[str, Parameter]:
-    # rclpy has no public name for what a node was started with.
-    return node._parameter_overrides
-
-
 def _declared(node: Node) -> list[str]:
-    return sorted(node.get_parameters_by_prefix(""))
+    names = node.get_parameters_by_prefix("")
+    return sorted(name for name in names if not name.startswith(f"{QOS_HEAD}."))
 
 
 def _nearest(name: str, known: list[str]) -> str:

@@ -20,7 +20,8 @@ __all__ = ["RegistrationClients"]
 
 _SERVICE_TYPE = "uw_dslam_msgs/srv/RegisterMaps"
 _SERVICE_NAME = "register_maps"
-_BUSY_PAUSE_S = 1.0
+_BUSY_PAUSE_S, _MAX_BUSY_PAUSE_S = 1.0, 8.0
+"""Maps are large, and one that is not active is busy for long."""
 
 
 @dataclass(slots=True, eq=False)
@@ -35,6 +36,7 @@ class _Server:
     client: Client
     asked: dict[int, _Asked] = field(default_factory=dict)
     busy_until_s: float = 0.0
+    busy_pause_s: float = _BUSY_PAUSE_S  # until it is asked again
     num_silent: int = 0  # requests in a row that it did not answer in time
     instance: str = ""
 
@@ -81,6 +83,10 @@ class RegistrationClients:
             RegisterMaps, service_name, qos_profile=SERVICES, callback_group=self._group
         )
         self._servers[service_name] = _Server(service_name, client)
+
+    def set_limits(self, max_per_server: int, timeout_s: float) -> None:
+        """Of the requests that are asked from now on."""
+        self._max_per_server, self._timeout_s = max_per_server, timeout_s
 
     def discover(self) -> None:
         """Look for new servers."""
@@ -149,7 +155,10 @@ class RegistrationClients:
         server.num_silent = 0
         response: Any = future.result()
         if response.result == RegisterMaps.Response.BUSY:
-            server.busy_until_s = time.monotonic() + _BUSY_PAUSE_S
+            server.busy_until_s = time.monotonic() + server.busy_pause_s
+            server.busy_pause_s = min(2.0 * server.busy_pause_s, _MAX_BUSY_PAUSE_S)
+        else:
+            server.busy_pause_s = _BUSY_PAUSE_S
         on_answer(request_id, response)
 
     def take_lost(self) -> list[tuple[int, str]]:
