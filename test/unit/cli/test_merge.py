@@ -30,7 +30,15 @@ T_WORLD_MAP = {
 # An answer with all its numbers; who asks does not matter.
 TEMPLATE = missions.answer(
     MatchRequest(
-        0, missions.room(), missions.room(), None, (), (), ("auv_2", 0, 0), ("auv_1", 0, 0)
+        0,
+        missions.room(),
+        missions.room(),
+        None,
+        (),
+        (),
+        ("auv_2", 0, 0),
+        ("auv_1", 0, 0),
+        (b"", b"", ()),
     )
 )
 

@@ -81,7 +81,9 @@ def test_baselines_find_a_small_motion(matcher, fleet):
     T_world_target = SE2(38.0, 35.0, 0.2)
     T_world_source = T_world_target @ SE2(1.0, -0.5, 0.05)
     source, target = (view_from(fleet.world, T, 12.0) for T in (T_world_source, T_world_target))
-    found = matcher(MatchRequest(1, source, target, None, ids, ids, ids[0], ids[0]))
+    found = matcher(
+        MatchRequest(1, source, target, None, ids, ids, ids[0], ids[0], (b"", b"", ()))
+    )
     error_m, error_rad = found.T_target_source.distance_to(SE2(1.0, -0.5, 0.05))
     assert error_m < 0.5
     assert error_rad < 0.05

@@ -218,6 +218,19 @@ def test_a_cancelled_request_is_asked_again_and_a_late_answer_is_dropped():
     assert queue.num_registrations == 0
 
 
+def test_answers_that_are_corrected_count_as_if_they_had_been_the_first():
+    queue, wanted = filled(), filled()
+    first, second = KnowingMatcher(FLEET, seed=1), KnowingMatcher(FLEET, seed=2)
+    asked = []
+    answer_all(queue, lambda request: asked.append(request) or first(request))
+    answer_all(wanted, second)
+    map_before = map_bytes(queue)
+    for request in asked:
+        queue.correct_answer(request.key, second(request))
+    answer_all(queue, second)
+    assert map_bytes(queue) == map_bytes(wanted) != map_before
+
+
 def test_vehicle_poses_agree_with_the_trajectories():
     queue = filled()
     answer_all(queue, KnowingMatcher(FLEET))

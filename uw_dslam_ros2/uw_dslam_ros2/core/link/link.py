@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Iterator
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.link.coding.answers import decode_answer
 from uw_dslam_ros2.core.link.coding.codec import (
     Layer,
     LayeredSubmap,
@@ -126,7 +127,14 @@ class AcousticLink:
         return []
 
     def add_answer(self, answer: bytes) -> None:
-        """Tell the others the answer to a question; see `answers`."""
+        """Tell the others the answer to a question; see `answers`.
+
+        Raises
+        ------
+        InvalidInputError
+            Where the bytes are no answer.
+        """
+        decode_answer(answer)
         content = bytes([ItemKind.ANSWER]) + answer
         if all(item.content != content for item in self._outbox.items):
             self._outbox.add(content, _ANSWER_RANK, "answers")
@@ -215,6 +223,11 @@ class AcousticLink:
     def num_open(self, now_s: float) -> int:
         """Own items that somebody lacks, or that were not sent yet."""
         return self._outbox.num_open(self._peers(now_s))
+
+    @property
+    def num_asked(self) -> int:
+        """Layers of others that are wanted and have not come."""
+        return len(self._asks)
 
     @property
     def is_complete(self) -> bool:
@@ -346,6 +359,7 @@ class AcousticLink:
             key, data = read_layer(body)
             self._take_layer(sender, key, data)
         elif kind is ItemKind.ANSWER:
+            decode_answer(body.rest)  # else it is refused
             self._answers.append(body.rest)
         else:
             raise InvalidInputError(f"an item of kind {kind.name}, expected one to keep")

@@ -40,6 +40,10 @@ class Planning:
         kept = {i: s for i, s in submaps.items() if i not in self._implausible}
         return Library(kept, frozenset(withdrawn), self._memory)
 
+    def forget(self) -> None:
+        """Work all out anew: a question has another answer than before."""
+        self._memory.clear()
+
     def plan(
         self,
         library: Library,

@@ -98,6 +98,14 @@ class MapQueue:
         self._answers[query.key] = Answer.of(query, result)
         self._change()
 
+    def correct_answer(self, key: QueryKey, result: RegistrationResult) -> None:
+        """Put another answer in the place of one that was had; no such one: nothing changes."""
+        held = self._answers.get(key)
+        if held is not None:
+            self._answers[key] = Answer.of(held.query, result)
+            self._planning.forget()
+            self._change()
+
     def cancel_request(self, request_id: int) -> None:
         """Forget that a request was asked (its server died); it will be asked again."""
         self._in_flight.pop(request_id, None)
@@ -352,6 +360,7 @@ class MapQueue:
             query.target.ids,
             query.source.reference,
             query.target.reference,
+            query.key,
         )
 
     def _undrawable(self) -> dict[SubmapId, str]:

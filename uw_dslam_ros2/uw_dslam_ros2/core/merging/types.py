@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core import pose_graph
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging.graph.answers import QueryKey
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
@@ -62,6 +63,8 @@ class MatchRequest:
     target_ids: tuple[SubmapId, ...]
     source_reference: SubmapId
     target_reference: SubmapId
+    key: QueryKey
+    """What makes two requests the same question; see `MapQueue.correct_answer`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,7 +25,7 @@ from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.missing_submaps import MissingSubmaps
 from uw_dslam_ros2.ros.plumbing.node_settings import AcousticLinkConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
-from uw_dslam_ros2.ros.plumbing.qos import LATCHED, MODEM, SUBMAPS
+from uw_dslam_ros2.ros.plumbing.qos import ANSWERS, LATCHED, MODEM, SUBMAPS
 from uw_dslam_ros2.ros.plumbing.running import run_node
 
 __all__ = ["AcousticLinkNode", "main"]
@@ -70,12 +70,17 @@ class AcousticLinkNode(Node):
             self.create_subscription(
                 MergeStatus, "/merge_status", self._on_status, LATCHED, callback_group=group
             )
+        self._answers_heard = self.create_publisher(UInt8MultiArray, "link/answers_heard", ANSWERS)
+        self.create_subscription(
+            UInt8MultiArray, "link/answers", self._on_answer, ANSWERS, callback_group=group
+        )
         self._submap_topic = self.resolve_topic_name("submap")
         self._wanted: dict[Track, int] = {}
         self._missing = MissingSubmaps(
             self, lambda job: job(), lambda _, msg: self._on_submap(msg)
         )
         self._give(self._link.submaps())
+        self._give_answers()
         self._diagnostics = Diagnostics(self, self._report, self._vehicle_id)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_SAVE_PERIOD_S, self._save, clock=steady, callback_group=group)
@@ -142,6 +147,14 @@ class AcousticLinkNode(Node):
             found = self._link.receive(bytes(msg.data), self._now_s())
         self._is_changed = True
         self._give(found)
+        self._give_answers()
+
+    def _on_answer(self, msg: UInt8MultiArray) -> None:
+        try:
+            with self._lock:
+                self._link.add_answer(bytes(msg.data))
+        except InvalidInputError as error:
+            self._complain(str(error))
 
     def _on_ready(self, _: Empty) -> None:
         with self._lock:
@@ -178,6 +191,12 @@ class AcousticLinkNode(Node):
             self._is_changed = True
             self._output_of(submap).publish(submap_to_msg(submap))
 
+    def _give_answers(self) -> None:
+        with self._lock:
+            answers = self._link.take_answers()
+        for answer in answers:
+            self._answers_heard.publish(UInt8MultiArray(data=answer))
+
     def _output_of(self, submap: Submap) -> Publisher:
         name = re.sub(r"\W", "_", submap.vehicle_id, flags=re.ASCII)
         topic = f"link/{name if name[0].isalpha() else '_' + name}/submap"
@@ -209,6 +228,7 @@ class AcousticLinkNode(Node):
                 "vehicles heard": sum(1 for n in range(32) if link.age_s(n, now_s) is not None),
                 "submaps known": sum(1 for _ in link.outlines()),
                 "items to send": link.num_open(now_s),
+                "layers asked for": link.num_asked,
                 "loss": link.loss,
                 "received packets": counts.received_packets,
                 "received bytes": counts.received_bytes,

@@ -232,6 +232,7 @@ class MapQueueManager(ManagedNode):
         """Note that the queue was changed."""
         self._message = message
         self._is_changed = True
+        self._requests.note_change()
         self._keeper.note_change()
 
     def _tick(self) -> None:

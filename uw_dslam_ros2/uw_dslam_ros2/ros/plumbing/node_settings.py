@@ -128,6 +128,11 @@ class MapQueueManagerConfig(Config):
     full_map_period_s: float = setting(
         5.0, 0.0, 3600.0, "between two whole maps while only parts change: those go as updates [s]"
     )
+    link: str = setting(
+        "",
+        doc="namespace of this vehicle's acoustic link: what others have answered is not searched "
+        "again; empty: none",
+    )
     session: str = setting(
         "",
         doc="folder: read at the start where it exists, written after every change; empty: none",

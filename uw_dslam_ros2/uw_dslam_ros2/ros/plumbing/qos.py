@@ -3,6 +3,7 @@
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 __all__ = [
+    "ANSWERS",
     "CLOCK",
     "DEFAULT",
     "LATCHED",
@@ -37,6 +38,13 @@ SERVICES = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 MODEM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """Packets between a link and its modem: what is lost on the way is lost in the water."""
+
+ANSWERS = QoSProfile(
+    depth=1000,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""Shared answers of registrations: who starts again gets those from before."""
 
 PLAYBACK = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 """What a bag player offers: reliable, so that large images arrive; best effort matches it too."""

@@ -11,6 +11,7 @@ from uw_dslam_msgs.srv import RegisterMaps
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import MapQueue, MatchRequest, StartPoses
+from uw_dslam_ros2.core.merging.graph.answers import QueryKey
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg, submap_frame_id
@@ -18,6 +19,7 @@ from uw_dslam_ros2.ros.convert.registration import options_to_msg, registration_
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S
 from uw_dslam_ros2.ros.plumbing.node_settings import MapQueueManagerConfig
 from uw_dslam_ros2.ros.plumbing.registration_clients import RegistrationClients
+from uw_dslam_ros2.ros.plumbing.shared_answers import SharedAnswers
 
 __all__ = ["QueueRequests"]
 
@@ -30,6 +32,8 @@ class _Owner(Protocol):
     def queue(self) -> MapQueue: ...
 
     def changed(self, message: str) -> None: ...
+
+    def complain(self, text: str) -> None: ...
 
 
 class QueueRequests:
@@ -65,6 +69,7 @@ class QueueRequests:
         self._servers = RegistrationClients(
             node, config.servers, config.requests_per_server, config.request_timeout_s, post
         )
+        self._shared = SharedAnswers(node, config.link, post, self._correct, owner.complain)
 
     def set_limits(self, config: MapQueueManagerConfig) -> None:
         """How many requests a server gets, and how long is waited, from the next one on."""
@@ -90,11 +95,16 @@ class QueueRequests:
         self._servers.forget_all()
         self._asked.clear()
 
+    def note_change(self) -> None:
+        """The queue may have other questions than before."""
+        self._shared.note_change()
+
     def look(self) -> None:
         """Ask again what was lost, and ask what there are servers for."""
         for request_id, reason in self._servers.take_lost():
             self._ask_again(request_id, reason)
-        num_free = self._servers.num_free()
+        # What others have answered needs no server.
+        num_free = self._servers.num_free() or self._shared.num_worth_a_look()
         if num_free > 0:
             for request in self._owner.queue.next_requests(num_free):
                 self._ask(request)
@@ -104,6 +114,9 @@ class QueueRequests:
         # number of boxes decides, and this is for what never ends.
         max_seconds = _SEARCH_SHARE * self._timeout_s
         prior = request.prior or self._start_prior(request)
+        if (known := self._shared.find(request, prior)) is not None:
+            self._take(request, known)
+            return
         msg = RegisterMaps.Request(options=options_to_msg(prior, max_seconds))
         frames = (
             submap_frame_id(request.source_reference),
@@ -133,16 +146,26 @@ class QueueRequests:
         if response.result == RegisterMaps.Response.DONE:
             try:
                 result = registration_from_msg(response.registration)
+                prior = request.prior or self._start_prior(request)
+                result = self._shared.settle(request, prior, result)
             except InvalidInputError as error:
                 result = _unanswered(f"unusable answer: {error}")
         else:
             result = _unanswered(f"the server could not answer: {response.message}")
+        self._take(request, result)
+
+    def _take(self, request: MatchRequest, result: RegistrationResult) -> None:
         self.counts[f"num_{result.verdict.name.lower()}"] += 1
-        self._owner.queue.add_result(request_id, result)
+        self._owner.queue.add_result(request.request_id, result)
         pair = f"{_names(request.source_ids)} to {_names(request.target_ids)}"
         message = f"{pair}: {result.verdict.name}: {result.reason}"
         self._owner.changed(message)
         self._node.get_logger().info(message)
+
+    def _correct(self, key: QueryKey, result: RegistrationResult) -> None:
+        """Use the answer that all use, not the own one."""
+        self._owner.queue.correct_answer(key, result)
+        self._owner.changed("another vehicle's answer has replaced an own one")
 
     def _ask_again(self, request_id: int, reason: str) -> None:
         self._asked.pop(request_id, None)

@@ -1,0 +1,119 @@
+"""Answers of registrations that managers tell each other over an acoustic link."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from std_msgs.msg import UInt8MultiArray
+
+from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.link.coding.answers import AnswerExchange, decode_answer, question_digest
+from uw_dslam_ros2.core.merging import MatchRequest
+from uw_dslam_ros2.core.merging.graph.answers import QueryKey
+from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
+from uw_dslam_ros2.ros.plumbing.qos import ANSWERS
+
+__all__ = ["SharedAnswers"]
+
+_ALL = 1000
+
+
+class SharedAnswers:
+    """A question that somebody has answered is not searched again, and all use the same bytes.
+
+    Without a link it does nothing.
+
+    Parameters
+    ----------
+    node
+        Whose topics they are.
+    link
+        Namespace of the acoustic link's node; empty: there is none.
+    post
+        Hands a function to the thread that owns this object.
+    on_correction
+        Called with a question of the queue that has another answer than it was given, and that
+        answer.
+    complain
+        Called with what is wrong with a message.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        link: str,
+        post: Callable[[Callable[[], None]], None],
+        on_correction: Callable[[QueryKey, RegistrationResult], None],
+        complain: Callable[[str], None],
+    ) -> None:
+        self._on_correction, self._complain = on_correction, complain
+        self._exchange = AnswerExchange()
+        self._used: dict[bytes, tuple[QueryKey, bytes]] = {}
+        self._is_worth_a_look = False
+        self._output: Publisher | None = None
+        if not link:
+            return
+        topic = f"/{link.strip('/')}/link/answers"
+        self._output = node.create_publisher(UInt8MultiArray, topic, ANSWERS)
+        node.create_subscription(
+            UInt8MultiArray,
+            f"{topic}_heard",
+            lambda msg: post(lambda: self._take(bytes(msg.data))),
+            ANSWERS,
+            callback_group=ReentrantCallbackGroup(),
+        )
+
+    def note_change(self) -> None:
+        """There may be new questions, which others have answered."""
+        self._is_worth_a_look = True
+
+    def num_worth_a_look(self) -> int:
+        """How many open questions others may have answered, if no server is free to be asked."""
+        if self._output is None or not self._is_worth_a_look:
+            return 0
+        self._is_worth_a_look = False
+        return _ALL
+
+    def find(self, request: MatchRequest, prior: PriorWindow | None) -> RegistrationResult | None:
+        """What somebody has answered to a request in this window."""
+        if self._output is None:
+            return None
+        question = question_digest(request.source, request.target, prior)
+        found = self._exchange.find(question)
+        if found is not None:
+            self._used[question] = request.key, self._exchange.data(question)
+        return found
+
+    def settle(
+        self, request: MatchRequest, prior: PriorWindow | None, result: RegistrationResult
+    ) -> RegistrationResult:
+        """Tell an own answer, unless a better one was heard; returns what all are to use."""
+        if self._output is None:
+            return result
+        question = question_digest(request.source, request.target, prior)
+        heard = self._exchange.find(question) is not None
+        before = self._exchange.data(question) if heard else b""
+        settled = self._exchange.settle(question, result)
+        data = self._exchange.data(question)
+        if data != before:
+            self._output.publish(UInt8MultiArray(data=data))
+        self._used[question] = request.key, data
+        return settled
+
+    def _take(self, data: bytes) -> None:
+        try:
+            question, _ = decode_answer(data)
+            self._exchange.take(data)
+        except InvalidInputError as error:
+            self._complain(f"answer refused: {error}")
+            return
+        self._is_worth_a_look = True
+        if question not in self._used:
+            return
+        key, used = self._used[question]
+        if self._exchange.data(question) != used:
+            self._used[question] = key, self._exchange.data(question)
+            self._on_correction(key, decode_answer(self._exchange.data(question))[1])
