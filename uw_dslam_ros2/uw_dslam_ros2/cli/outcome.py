@@ -25,8 +25,9 @@ from uw_dslam_ros2.core.merging import (
     SubmapState,
 )
 from uw_dslam_ros2.core.merging.graph.answers import Answer
+from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap, SubmapId, Track, track_name
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
@@ -37,6 +38,8 @@ __all__ = ["Outcome", "RegistrationRow", "VehicleOutcome", "outcome_of", "write_
 
 FloatArray = NDArray[np.float64]
 Trajectory = tuple[NDArray[np.int64], FloatArray]
+
+_AS_GIVEN = RunNames(())
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +79,9 @@ class RegistrationRow:
     has_prior: bool
 
     @classmethod
-    def of(cls, number: int, answer: Answer, is_used: bool) -> RegistrationRow:
+    def of(
+        cls, number: int, answer: Answer, is_used: bool, names: RunNames = _AS_GIVEN
+    ) -> RegistrationRow:
         """Flatten an answer."""
         motion, numbers = answer.T_target_source, answer.numbers
         x, y, yaw = (math.nan,) * 3 if motion is None else (motion.x, motion.y, motion.yaw)
@@ -85,10 +90,10 @@ class RegistrationRow:
         lower = numbers.get("lower_bound", math.nan)
         return cls(
             number,
-            names_of(answer.query.source.ids),
-            names_of(answer.query.target.ids),
-            names_of([answer.query.source.reference]),
-            names_of([answer.query.target.reference]),
+            names_of(answer.query.source.ids, names),
+            names_of(answer.query.target.ids, names),
+            names.submap(answer.query.source.reference),
+            names.submap(answer.query.target.reference),
             answer.verdict.name,
             answer.why,
             is_used,
@@ -151,6 +156,11 @@ class Outcome:
     """Vehicles of which there is no map at all."""
 
     @property
+    def names(self) -> RunNames:
+        """Of the vehicles' runs, for people."""
+        return RunNames(record.submap for record in self.records)
+
+    @property
     def num_vehicles(self) -> int:
         """All, those without a map included."""
         return len(self.vehicles) + len(self.unmapped)
@@ -170,12 +180,14 @@ class Outcome:
         return {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))}
 
 
-def names_of(ids: Iterable[SubmapId]) -> str:
+def names_of(ids: Iterable[SubmapId], names: RunNames = _AS_GIVEN) -> str:
     """Submaps as text: ``auv_1/0-3`` for four of one vehicle."""
     by_track: dict[Track, list[int]] = {}
     for submap_id in ids:
         by_track.setdefault(submap_id.track, []).append(submap_id.sequence)
-    return " + ".join(f"{track_name(t)}/{_ranges(sorted(s))}" for t, s in sorted(by_track.items()))
+    return " + ".join(
+        f"{names.track(t)}/{_ranges(sorted(s))}" for t, s in sorted(by_track.items())
+    )
 
 
 def _ranges(numbers: list[int]) -> str:
@@ -191,6 +203,7 @@ def _ranges(numbers: list[int]) -> str:
 def outcome_of(queue: MapQueue) -> Outcome:
     """Take everything out of a queue that has settled."""
     records = queue.submaps()
+    names = RunNames(record.submap for record in records)
     trajectories = queue.trajectories()
     vehicles = []
     for vehicle_id in sorted({record.submap.vehicle_id for record in records}):
@@ -206,7 +219,7 @@ def outcome_of(queue: MapQueue) -> Outcome:
                 trajectories.get(vehicle_id) if merged else None,
                 len(own),
                 len(merged),
-                (others or merged)[0].reason,
+                names.in_text((others or merged)[0].reason),
             )
         )
     return Outcome(
@@ -215,7 +228,7 @@ def outcome_of(queue: MapQueue) -> Outcome:
         tuple(queue.constraints()),
         queue.global_map(),
         tuple(
-            RegistrationRow.of(number, answer, is_used)
+            RegistrationRow.of(number, answer, is_used, names)
             for number, (answer, is_used) in enumerate(queue.answers(), start=1)
         ),
         queue.provenance(),
@@ -257,9 +270,10 @@ def write_outcome(folder: Path, outcome: Outcome) -> None:
         write_tum(folder / "trajectories" / f"{name}_alone.tum", *vehicle.own_trajectory)
         if vehicle.trajectory is not None:
             write_tum(folder / "trajectories" / f"{name}.tum", *vehicle.trajectory)
+    names = outcome.names
     for record in outcome.records:
         submap = record.submap
-        name = f"{track_name(submap.submap_id.track)}_{submap.sequence}"
+        name = f"{names.file(submap.submap_id.track)}_{submap.sequence}"
         write_map(folder / "submaps" / name, submap.grid)
     rows = [_strict(asdict(row)) for row in outcome.registrations]
     write_files(
@@ -298,9 +312,11 @@ def _csv_bytes(rows: list[dict[str, Any]]) -> bytes:
 
 
 def _submap_table(outcome: Outcome) -> list[dict[str, Any]]:
+    names = outcome.names
     return [
         {
             "vehicle_id": record.submap.vehicle_id,
+            "run": names.number(record.submap.submap_id.track),
             "run_id": record.submap.run_id,
             "sequence": record.submap.sequence,
             "revision": record.submap.revision,
@@ -308,7 +324,7 @@ def _submap_table(outcome: Outcome) -> list[dict[str, Any]]:
             "component": record.component,
             "T_component_submap": record.T_component_submap.as_array().tolist(),
             "num_tries": record.num_tries,
-            "reason": record.reason,
+            "reason": names.in_text(record.reason),
         }
         for record in outcome.records
     ]
@@ -316,12 +332,13 @@ def _submap_table(outcome: Outcome) -> list[dict[str, Any]]:
 
 def _graph_table(outcome: Outcome) -> dict[str, Any]:
     """Edges with their residuals, the wrong and the unsure ones included, and cycles."""
+    names = outcome.names
     return {
         "edges": [
             {
                 "kind": c.kind.name,
-                "source": str(c.source),
-                "target": str(c.target),
+                "source": names.submap(c.source),
+                "target": names.submap(c.target),
                 "T_target_source": c.T_target_source.as_array().tolist(),
                 "covariance": c.covariance.tolist(),
                 "residual_m": c.residual_m,
@@ -333,7 +350,7 @@ def _graph_table(outcome: Outcome) -> dict[str, Any]:
         ],
         "loops": [
             {
-                "submaps": [str(submap_id) for submap_id in loop.submaps],
+                "submaps": [names.submap(submap_id) for submap_id in loop.submaps],
                 "error_m": loop.error_m,
                 "error_deg": math.degrees(loop.error_rad),
             }

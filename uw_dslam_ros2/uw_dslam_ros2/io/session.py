@@ -30,6 +30,7 @@ from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig,
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
 from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
+from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.array_files import arrays_from_bytes, arrays_to_bytes
@@ -256,9 +257,9 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
     """Write a queue for other programs; missing folders are made.
 
     ``map.{yaml,pgm,png}`` (global map), ``map_contradictions.png`` and ``map_provenance.npz`` (who
-    saw what, see `write_provenance`), ``submaps/<vehicle>_<sequence>.*`` (each in its own
-    frame), ``trajectories/<vehicle>.tum`` (merged vehicles, in "map"), ``graph.g2o`` (the global
-    component, without the edges found wrong).
+    saw what, see `write_provenance`), ``submaps/<vehicle>_<sequence>.*`` (each in its own frame;
+    of a second run ``<vehicle>_run2_<sequence>.*``), ``trajectories/<vehicle>.tum`` (merged
+    vehicles, in "map"), ``graph.g2o`` (the global component, without the edges found wrong).
     """
     folder = Path(folder)
     written: list[Path] = []
@@ -269,9 +270,11 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
     if provenance is not None:
         written += write_provenance(folder / "map", provenance)
     records = queue.submaps()
+    names = RunNames(record.submap for record in records)
     for record in records:
         submap = record.submap
-        name = f"{_file_name(*submap.submap_id.track)}_{submap.sequence:04d}"
+        run = names.file(submap.submap_id.track, _file_name(submap.vehicle_id))
+        name = f"{run}_{submap.sequence:04d}"
         written += write_map(folder / "submaps" / name, submap.grid)
     for vehicle, (stamps_ns, poses) in queue.trajectories().items():
         path = folder / "trajectories" / f"{_file_name(vehicle)}.tum"
@@ -294,7 +297,7 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
     return [*written, write_g2o(folder / "graph.g2o", vertices, edges)]
 
 
-def _file_name(vehicle_id: str, run_id: int = 0) -> str:
+def _file_name(vehicle_id: str) -> str:
     """Name for a vehicle's files: different for different vehicles, short, and in its folder."""
     # Percent signs come from quoting alone, hence mark what stands for more than itself.
     name = quote(vehicle_id, safe="")
@@ -304,8 +307,7 @@ def _file_name(vehicle_id: str, run_id: int = 0) -> str:
         name = (
             f"{name[:_MAX_NAME]}%{hashlib.blake2b(vehicle_id.encode(), digest_size=8).hexdigest()}"
         )
-    name = name or "%"
-    return name if run_id <= 1 else f"{name}#{run_id}"
+    return name or "%"
 
 
 def _is_same_file(file: IO[str], path: Path) -> bool:

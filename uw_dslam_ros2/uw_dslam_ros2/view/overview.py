@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import Constraint, ConstraintKind, SubmapRecord, SubmapState
 from uw_dslam_ros2.core.merging.graph.answers import Answer
+from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId, Track, track_name
+from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = [
     "Names",
@@ -31,35 +32,11 @@ _OUTLINE_CELL_M = 0.5
 _TRACK_STEP_M = 0.2
 
 
-class Names:
-    """Names for people: a run's number, drawn at random, becomes the first, second, ... run.
-
-    Parameters
-    ----------
-    records
-        Of all submaps; a vehicle's runs are counted by the times of their first submaps.
-    """
+class Names(RunNames):
+    """Names for people of what a merge holds."""
 
     def __init__(self, records: Sequence[SubmapRecord]) -> None:
-        runs: dict[str, list[Track]] = {}
-        for record in sorted(records, key=lambda r: (r.submap.stamp_ns, r.submap.submap_id)):
-            track = record.submap.submap_id.track
-            known = runs.setdefault(track.vehicle_id, [])
-            if track not in known:
-                known.append(track)
-        self._shown = {
-            track: Track(vehicle_id, number)
-            for vehicle_id, tracks in runs.items()
-            for number, track in enumerate(tracks, start=1)
-        }
-
-    def track(self, track: Track) -> str:
-        """``auv_1``, and from a second run on ``auv_1#2``."""
-        return track_name(self._shown.get(track, track))
-
-    def submap(self, submap_id: SubmapId) -> str:
-        """``auv_1/3``."""
-        return f"{self.track(submap_id.track)}/{submap_id.sequence}"
+        super().__init__(record.submap for record in records)
 
 
 def outline_of(occupancy: OccupancyMap) -> FloatArray:

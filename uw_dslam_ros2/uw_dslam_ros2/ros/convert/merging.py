@@ -30,8 +30,9 @@ from uw_dslam_ros2.core.merging.types import (
     SubmapState,
 )
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
+from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Submap, SubmapId, track_name
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.ros.convert.core_types import (
     covariance_to_list,
     transform2d_from_msg,
@@ -44,7 +45,7 @@ __all__ = [
     "constraint_from_msg",
     "constraint_to_msg",
     "graph_to_markers",
-    "group_frame_id",
+    "group_frame_ids",
     "groups_to_msgs",
     "record_from_msg",
     "record_to_msg",
@@ -223,11 +224,14 @@ def _group_from_msg(poses: Sequence[SubmapPose], reference: int, name: str) -> S
     return SubmapGroup(list(members)[reference], members, key)
 
 
-def group_frame_id(component: int, records: Sequence[SubmapRecord], map_frame: str) -> str:
-    """Frame of a group: the map's own, or one that is named after its first vehicle and run."""
-    if component == 0:
-        return map_frame
-    return f"{map_frame}_{track_name(records[0].submap.submap_id.track)}"
+def group_frame_ids(records: Sequence[SubmapRecord], map_frame: str) -> dict[int, str]:
+    """Frame of each group: the map's own, or one that is named after its first vehicle and run."""
+    names = RunNames(record.submap for record in records)
+    frames = {0: map_frame}
+    for record in records:
+        first = names.file(record.submap.submap_id.track)
+        frames.setdefault(record.component, f"{map_frame}_{first}")
+    return frames
 
 
 def groups_to_msgs(records: Sequence[SubmapRecord], map_frame: str) -> list[MergeGroup]:
@@ -235,10 +239,11 @@ def groups_to_msgs(records: Sequence[SubmapRecord], map_frame: str) -> list[Merg
     members: dict[int, list[SubmapRecord]] = {}
     for record in records:
         members.setdefault(record.component, []).append(record)
+    frames = group_frame_ids(records, map_frame)
     return [
         MergeGroup(
             component=component,
-            frame_id=group_frame_id(component, own, map_frame),
+            frame_id=frames[component],
             vehicle_ids=sorted({record.submap.vehicle_id for record in own}),
             num_submaps=len(own),
         )

@@ -22,7 +22,7 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.ros.convert.merging import (
     constraint_to_msg,
     graph_to_markers,
-    group_frame_id,
+    group_frame_ids,
     groups_to_msgs,
     record_to_msg,
 )
@@ -125,17 +125,17 @@ class QueueFrames:
 
     def _places(self, queue: MapQueue) -> list[tuple[str, str, SE2]]:
         """Of each vehicle's newest run: frame of its group, vehicle, place of its map there."""
-        groups: dict[int, list[SubmapRecord]] = {}
+        records = queue.submaps()
+        frames = group_frame_ids(records, self._map_frame)
         newest: dict[str, SubmapRecord] = {}
-        for record in queue.submaps():
+        for record in records:
             submap = record.submap
-            groups.setdefault(record.component, []).append(record)
             is_newest_run = submap.run_id == queue.newest_run(submap.vehicle_id)
             if is_newest_run and record.state is not SubmapState.SET_ASIDE:
                 newest[submap.vehicle_id] = record
         return [
             (
-                group_frame_id(record.component, groups[record.component], self._map_frame),
+                frames[record.component],
                 vehicle_id,
                 record.T_component_submap @ record.submap.T_odom_submap.inverse(),
             )
