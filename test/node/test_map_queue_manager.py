@@ -166,6 +166,23 @@ def test_vehicles_that_are_not_joined_have_a_group_and_a_frame_of_their_own(mana
         until(lambda: ("map_auv_1", "auv_1/map") in probe.transforms, "the other's new parent")
 
 
+def test_each_group_that_is_not_joined_has_a_map_of_its_own(manage):
+    with manage(has_server=False, **FAST) as (until, probe, call):
+        maps = []
+        probe.node.create_subscription(OccupancyGrid, "/map_auv_2", maps.append, LATCHED)
+        for submap in two_submaps():
+            probe.send(submap)
+        until(lambda: maps and probe.maps, "both maps")
+        own = two_submaps()[1].grid
+        assert maps[-1].header.frame_id == "map_auv_2"
+        assert (occupancy_from_msg(maps[-1]).values > 50).sum() == (own.values > 50).sum()
+        assert (occupancy_from_msg(probe.maps[-1]).values > 50).sum() == (own.values > 50).sum()
+        call(WithdrawSubmap, "withdraw_submap", vehicle_id="auv_2", sequence=0)
+        until(lambda: maps[-1].info.width == 0, "the end of the map")
+        call(RestoreSubmap, "restore_submap", vehicle_id="auv_2", sequence=0)
+        until(lambda: maps[-1].info.width > 0, "the map again")
+
+
 def test_a_name_belongs_to_the_topic_that_had_it_first(manage):
     first, second = two_submaps()
     with manage(has_server=False, **FAST) as (until, probe, _):

@@ -123,3 +123,9 @@ def _rows(tables):
 
 def test_a_settings_file_may_name_every_node_that_has_settings():
     assert set(settings_files.NODES) == set(NODE_CONFIGS)
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_the_documentation_says_which_parameters_can_change_while_a_node_runs(name):
+    text = (ROOT / "docs" / "interfaces.md").read_text()
+    assert [live for live in NODES[name].live if f"`{live}`" not in text] == []

@@ -21,6 +21,7 @@ from uw_dslam_ros2.io.session import load_session
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_id_of
 from uw_dslam_ros2.ros.plumbing.diagnostics import Report
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S
+from uw_dslam_ros2.ros.plumbing.group_maps import GroupMaps
 from uw_dslam_ros2.ros.plumbing.idle_timeout import IdleTimeout
 from uw_dslam_ros2.ros.plumbing.managed_node import ManagedNode
 from uw_dslam_ros2.ros.plumbing.map_inputs import MapInputs
@@ -83,6 +84,7 @@ class MapQueueManager(ManagedNode):
         self._resume()
         self._group = ReentrantCallbackGroup()
         self._map = MapPublisher(self, self._config.map_frame, self._config.full_map_period_s)
+        self._group_maps = GroupMaps(self, self._config.map_frame)
         self._status = StatusPublisher(self, self._config.map_frame)
         self._topics: set[str] = set()
         self._owners: dict[str, str] = {}
@@ -278,6 +280,7 @@ class MapQueueManager(ManagedNode):
         return int(self.get_clock().now().nanoseconds)
 
     def _publish_map(self) -> None:
+        self._group_maps.publish(self._queue.submaps(), self._now())
         changed = self._queue.changed_window()
         if changed is None:
             return
@@ -308,6 +311,7 @@ class MapQueueManager(ManagedNode):
         self._queue = queue
         self._maps.forget()
         self._map.clear()
+        self._group_maps.clear()
         return queue
 
     def settle(self) -> None:
