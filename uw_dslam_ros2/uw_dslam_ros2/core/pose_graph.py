@@ -24,6 +24,7 @@ __all__ = [
     "chained_covariance",
     "chi2_threshold",
     "compose_covariance",
+    "compose_covariances",
     "invert_covariance",
     "mahalanobis",
     "residual",
@@ -92,6 +93,21 @@ def compose_covariance(covariance: FloatArray, left: SE2, middle: SE2, right: SE
     return jacobian @ covariance @ jacobian.T
 
 
+def compose_covariances(
+    covariance: FloatArray, left: FloatArray, middle: FloatArray, right: FloatArray
+) -> FloatArray:
+    """`compose_covariance` of many: covariances (N, 3, 3), motions (N, 3) [x, y, yaw]."""
+    cos, sin = np.cos(middle[:, 2]), np.sin(middle[:, 2])
+    x = cos * right[:, 0] - sin * right[:, 1]
+    y = sin * right[:, 0] + cos * right[:, 1]
+    cos, sin = np.cos(left[:, 2]), np.sin(left[:, 2])
+    jacobian = np.zeros((len(left), 3, 3))
+    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 0, 2] = cos, -sin, -cos * y - sin * x
+    jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = sin, cos, -sin * y + cos * x
+    jacobian[:, 2, 2] = 1.0
+    return jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+
+
 def invert_covariance(covariance: FloatArray, motion: SE2) -> FloatArray:
     """Covariance of ``motion.inverse()`` when that of `motion` is given."""
     back = motion.inverse()
@@ -103,10 +119,11 @@ def invert_covariance(covariance: FloatArray, motion: SE2) -> FloatArray:
     return jacobian @ covariance @ jacobian.T
 
 
-def mahalanobis(difference: SE2, covariance: FloatArray) -> float:
-    """Squared distance of a motion from none, in units of its covariance."""
-    vector = difference.as_array()
-    return float(vector @ np.linalg.solve(_regular(covariance), vector))
+def mahalanobis(differences: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Squared distances (N,) of motions (N, 3) from none, in units of covariances (N, 3, 3)."""
+    regular = 0.5 * (covariances + np.swapaxes(covariances, 1, 2)) + _FLOOR
+    solved = np.linalg.solve(regular, differences[:, :, None])[:, :, 0]
+    return np.asarray(np.sum(differences * solved, axis=1))
 
 
 def residual[KeyT: Hashable](

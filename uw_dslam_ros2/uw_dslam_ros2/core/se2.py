@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 
-__all__ = ["SE2", "wrap_angle"]
+__all__ = ["SE2", "compose_poses", "invert_poses", "wrap_angle"]
 
 FloatArray = NDArray[np.float64]
 _TWO_PI = 2.0 * math.pi
@@ -108,3 +108,20 @@ class SE2:
             math.hypot(self.x - other.x, self.y - other.y),
             abs(wrap_angle(self.yaw - other.yaw)),
         )
+
+
+def compose_poses(T_a_b: FloatArray, T_b_c: FloatArray) -> FloatArray:
+    """Compose many motions at once: ``T_a_c`` (N, 3) of arrays (N, 3) [x, y, yaw]."""
+    cos, sin = np.cos(T_a_b[:, 2]), np.sin(T_a_b[:, 2])
+    x, y = T_b_c[:, 0], T_b_c[:, 1]
+    turned = cos * x - sin * y, sin * x + cos * y, T_b_c[:, 2]
+    composed = T_a_b + np.column_stack(turned)
+    composed[:, 2] = wrap_angle(composed[:, 2])
+    return composed
+
+
+def invert_poses(T_a_b: FloatArray) -> FloatArray:
+    """Invert many motions at once: ``T_b_a`` (N, 3) of an array (N, 3) [x, y, yaw]."""
+    cos, sin = np.cos(T_a_b[:, 2]), np.sin(T_a_b[:, 2])
+    x, y = T_a_b[:, 0], T_a_b[:, 1]
+    return np.column_stack([-cos * x - sin * y, sin * x - cos * y, wrap_angle(-T_a_b[:, 2])])

@@ -12,7 +12,8 @@ from uw_dslam_ros2.core.merging.asking.plan import Plan, make_plan
 from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track, implausible_submaps
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
-from uw_dslam_ros2.core.merging.graph.library import Library, Memory
+from uw_dslam_ros2.core.merging.graph.library import Library
+from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.submap import SubmapId, Track
 
@@ -26,7 +27,7 @@ class Planning:
 
     def __init__(self, config: MapQueueConfig) -> None:
         self._config = config
-        self._memory: Memory = {}
+        self._memory = Memory()
         self._implausible: dict[SubmapId, str] = {}
         self._contradicting: list[Track] = []
         self.aside: dict[SubmapId, str] = {}
@@ -42,7 +43,7 @@ class Planning:
 
     def forget(self) -> None:
         """Work all out anew: a question has another answer than before."""
-        self._memory.clear()
+        self._memory = Memory()
 
     def plan(
         self,
@@ -80,13 +81,13 @@ class Planning:
                 if track is None:
                     break
                 self._contradicting.append(track)
-                sound = self._without(library, self._contradicting)
+                sound = library.without(self._contradicting)
                 plan = plan_with(sound)
             plan = dataclasses.replace(plan, wanted=[*whole.wanted, *plan.wanted])
         elif held := [track for track in self._contradicting if track in tracks]:
             # While questions are open, what was judged before goes on to hold.
             wanted = plan.wanted
-            plan = plan_with(self._without(library, held))
+            plan = plan_with(library.without(held))
             known = {query.key for query in wanted}
             wanted += [query for query in plan.wanted if query.key not in known]
             plan = dataclasses.replace(plan, wanted=wanted)
@@ -94,10 +95,6 @@ class Planning:
             i: _CONTRADICTS for i in library.submaps if i.track in self._contradicting
         }
         return plan
-
-    def _without(self, library: Library, tracks: Sequence[Track]) -> Library:
-        kept = {i: s for i, s in library.submaps.items() if i.track not in tracks}
-        return Library(kept, library.withdrawn, self._memory)
 
     def _plan_with(
         self,

@@ -29,6 +29,9 @@ from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["MapQueue"]
 
+_REPLAN_SHARE = 0.125
+"""Of a plan's questions: so many are answered before `next_requests` makes another plan."""
+
 
 class MapQueue:
     """Collects the submaps of all vehicles and says which maps to register next.
@@ -49,6 +52,7 @@ class MapQueue:
         self._answers: dict[QueryKey, Answer] = {}
         self._standing: frozenset[QueryKey] = frozenset()
         self._library: Library | None = None
+        self._questions: list[Query] = []  # of the last plan
         self._in_flight: dict[int, Query] = {}
         self._next_request_id = 1
         self._plan_cache: Plan | None = None
@@ -72,7 +76,7 @@ class MapQueue:
         """
         is_new = self._arrivals.add(submap)
         if is_new:
-            self._change()
+            self._change_submaps()
         return is_new
 
     def next_requests(self, max_requests: int) -> list[MatchRequest]:
@@ -82,7 +86,7 @@ class MapQueue:
         """
         asked = {query.key for query in self._in_flight.values()}
         requests: list[MatchRequest] = []
-        for query in self._plan().wanted:
+        for query in self._open_questions():
             if len(requests) >= max_requests:
                 break
             if query.key not in asked:
@@ -96,7 +100,7 @@ class MapQueue:
         if query is None:
             return
         self._answers[query.key] = Answer.of(query, result)
-        self._change()
+        self._plan_cache, self._is_drawn = None, False
 
     def correct_answer(self, key: QueryKey, result: RegistrationResult) -> None:
         """Put another answer in the place of one that was had; no such one: nothing changes."""
@@ -104,7 +108,7 @@ class MapQueue:
         if held is not None:
             self._answers[key] = Answer.of(held.query, result)
             self._planning.forget()
-            self._change()
+            self._change_submaps()
 
     def cancel_request(self, request_id: int) -> None:
         """Forget that a request was asked (its server died); it will be asked again."""
@@ -160,7 +164,7 @@ class MapQueue:
             return False
         if submap_id not in self._withdrawn:
             self._withdrawn.add(submap_id)
-            self._change()
+            self._change_submaps()
         return True
 
     def restore(self, submap_id: SubmapId) -> bool:
@@ -169,7 +173,7 @@ class MapQueue:
             return False
         if submap_id in self._withdrawn:
             self._withdrawn.discard(submap_id)
-            self._change()
+            self._change_submaps()
         return True
 
     def submaps(self) -> list[SubmapRecord]:
@@ -304,10 +308,25 @@ class MapQueue:
             self._library = self._planning.library(self._submaps, self._withdrawn)
         return self._library
 
-    def _change(self) -> None:
+    def _change_submaps(self) -> None:
         self._library = None
-        self._plan_cache = None
-        self._is_drawn = False
+        self._change()
+
+    def _change(self) -> None:
+        self._plan_cache, self._is_drawn = None, False
+        self._questions = []
+
+    def _open_questions(self) -> list[Query]:
+        """Of the last plan while few of its questions are answered, else of a new one.
+
+        A plan costs as much as many answers where there are many submaps, and a few answers change
+        little of it.
+        """
+        still_open = [query for query in self._questions if query.key not in self._answers]
+        num_answered = len(self._questions) - len(still_open)
+        if still_open and num_answered <= _REPLAN_SHARE * len(self._questions):
+            return still_open
+        return self._plan().wanted
 
     def _plan(self) -> Plan:
         if self._plan_cache is None:
@@ -327,7 +346,7 @@ class MapQueue:
             self._standing = frozenset(
                 constraint.key for constraint in plan.constraints if constraint.is_inlier
             )
-            self._plan_cache = plan
+            self._plan_cache, self._questions = plan, plan.wanted
             is_open = self._is_growing or bool(plan.wanted) or bool(self._in_flight)
             if self._note_frame(self._frame.settle(plan, self._sound(library), is_open)):
                 self._plan_cache = None

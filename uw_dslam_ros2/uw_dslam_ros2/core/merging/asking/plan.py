@@ -102,7 +102,8 @@ class _Planner:
         first = most_promising(ranked, self._config.max_partners)
         constraints = self._match_tracks(first)
         if not self._is_waiting():
-            apart = self._apart(constraints, [pair for pair in ranked if pair not in set(first)])
+            tried = set(first)
+            apart = self._apart(constraints, [pair for pair in ranked if pair not in tried])
             constraints += self._match_tracks(apart)
         if not self._is_waiting():
             constraints += self._match_meeting(constraints)
@@ -150,14 +151,12 @@ class _Planner:
         matched = {
             frozenset((j.edge.source.track, j.edge.target.track)) for j in solved if j.is_inlier
         }
+        number = {track: where[self._group_id(track)] for track in self._groups}
+        sides = {t: self._library.component_side(components[i], t) for t, i in number.items()}
         found: list[Constraint] = []
         for target, source in itertools.combinations(sorted(self._groups), 2):
-            index = where[self._group_id(target)]
-            if frozenset((source, target)) in matched or index != where[self._group_id(source)]:
-                continue
-            component = components[index]
-            sides = [self._library.component_side(component, t) for t in (source, target)]
-            found += self._verifier.constraints_nearby(sides[0], sides[1])
+            if number[source] == number[target] and frozenset((source, target)) not in matched:
+                found += self._verifier.constraints_nearby(sides[source], sides[target])
         return found
 
     def _match_components(self, constraints: Sequence[Constraint]) -> list[Constraint]:

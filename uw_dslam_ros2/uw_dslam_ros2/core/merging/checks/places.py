@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +10,9 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.merging.graph.consistency import Side
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.types import Edge
-from uw_dslam_ros2.core.pose_graph import compose_covariance
-from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.pose_graph import compose_covariances
+from uw_dslam_ros2.core.se2 import SE2, compose_poses, invert_poses
+from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["Ends", "meetings", "pose_uncertainty", "sigma_m", "vague_places"]
 
@@ -26,6 +24,7 @@ _MIN_SHARE = 0.25
 """Least common area of two submaps, as a share of the smaller, that is worth a check."""
 _MIN_VAGUE_SHARE = 0.4
 """The same for a further constraint, which nothing depends on."""
+_ROUNDING_M = 1e-6
 
 
 def meetings(
@@ -38,9 +37,11 @@ def meetings(
 ) -> list[Ends]:
     """Pairs of submaps that share most if the sides lie so; first those away from each other."""
     shares: list[tuple[float, SubmapId, SubmapId]] = []
+    targets = _Circles(library, target)
     for source_id, T_source in source.T_frame_submap.items():
         T_there = T_target_source @ T_source
-        for target_id, T_target in target.T_frame_submap.items():
+        for target_id in targets.near(T_there, library.submaps[source_id].radius_m):
+            T_target = target.T_frame_submap[target_id]
             share = _share(library, source_id, target_id, T_target.inverse() @ T_there)
             if share >= _MIN_SHARE:
                 shares.append((share, source_id, target_id))
@@ -82,19 +83,25 @@ def vague_places(
     list
         Source and target, and the covariance (3, 3) of where the one lies in the other.
     """
-    candidates: list[tuple[float, SubmapId, SubmapId, FloatArray]] = []
-    for target_id, source_id in itertools.combinations(sorted(side.T_frame_submap), 2):
-        if chosen is not None and target_id not in chosen and source_id not in chosen:
-            continue
-        if not _is_apart(source_id, target_id, 2 * num_neighbours + 1):
-            continue
-        share = _share(library, source_id, target_id, side.between(target_id, source_id))
-        if share < _MIN_VAGUE_SHARE:
-            continue
-        uncertainty = _known_best(source_id, target_id, side, edges)
-        cell_m = library.submaps[target_id].submap.grid.spec.resolution_m
-        if (sigma := sigma_m(uncertainty)) > vague_cells * cell_m:
-            candidates.append((share * sigma, source_id, target_id, uncertainty))
+    sharing: dict[Ends, float] = {}
+    circles = _Circles(library, side)
+    for target_id, T_target in sorted(side.T_frame_submap.items()):
+        for source_id in circles.near(T_target, library.submaps[target_id].radius_m):
+            if source_id <= target_id:
+                continue
+            if chosen is not None and target_id not in chosen and source_id not in chosen:
+                continue
+            if not _is_apart(source_id, target_id, 2 * num_neighbours + 1):
+                continue
+            share = _share(library, source_id, target_id, side.between(target_id, source_id))
+            if share >= _MIN_VAGUE_SHARE:
+                sharing[source_id, target_id] = share
+    pairs = [*sharing]
+    cells_m = [library.submaps[end].submap.grid.spec.resolution_m for _, end in pairs]
+    candidates = [
+        (sharing[ends] * sigma, *ends, uncertainty)
+        for ends, uncertainty, sigma in _vague(pairs, vague_cells * np.array(cells_m), side, edges)
+    ]
     candidates.sort(key=lambda item: (-item[0], item[1], item[2]))
     found = {
         (source_id, target_id): covariance for _, source_id, target_id, covariance in candidates
@@ -113,39 +120,109 @@ def pose_uncertainty(main: Edge | None, ends: Ends, source: Side, target: Side) 
             for side, end in zip((source, target), ends, strict=True)
         ]
         return np.sum([side.covariance(end, start) for side, start, end in ways], axis=0)
-    T_target = target.between(ends[1], main.target)
-    T_source = source.between(main.source, ends[0])
-    motion = main.T_target_source
-    return (
-        compose_covariance(
-            target.covariance(ends[1], main.target), SE2(), T_target, motion @ T_source
-        )
-        + compose_covariance(main.covariance, T_target, motion, T_source)
-        + compose_covariance(
-            source.covariance(main.source, ends[0]), T_target @ motion, T_source, SE2()
-        )
+    return _uncertainties([main], [ends], source, target)[0]
+
+
+def _uncertainties(
+    mains: Sequence[Edge], ends: Sequence[Ends], source: Side, target: Side
+) -> FloatArray:
+    """Covariances (N, 3, 3) of where one submap lies in another, over one edge each."""
+    motion = _stacked(main.T_target_source for main in mains)
+    T_target = compose_poses(
+        invert_poses(_stacked(target.T_frame_submap[end] for _, end in ends)),
+        _stacked(target.T_frame_submap[main.target] for main in mains),
     )
+    T_source = compose_poses(
+        invert_poses(_stacked(source.T_frame_submap[main.source] for main in mains)),
+        _stacked(source.T_frame_submap[end] for end, _ in ends),
+    )
+    pairs = list(zip(mains, ends, strict=True))
+    by_target = np.array([target.covariance(end, main.target) for main, (_, end) in pairs])
+    by_source = np.array([source.covariance(main.source, end) for main, (end, _) in pairs])
+    none = np.zeros_like(motion)
+    return (
+        compose_covariances(by_target, none, T_target, compose_poses(motion, T_source))
+        + compose_covariances(
+            np.array([main.covariance for main in mains]), T_target, motion, T_source
+        )
+        + compose_covariances(by_source, compose_poses(T_target, motion), T_source, none)
+    )
+
+
+def _stacked(motions: Iterable[SE2]) -> FloatArray:
+    return np.array([(motion.x, motion.y, motion.yaw) for motion in motions])
 
 
 def sigma_m(covariance: FloatArray) -> float:
     """Largest standard deviation of the translation."""
-    return math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
+    return float(_sigmas_m(covariance[None])[0])
 
 
-def _known_best(
-    source_id: SubmapId, target_id: SubmapId, side: Side, edges: Sequence[Edge]
-) -> FloatArray:
-    """Covariance (3, 3) of a relative pose along odometry, or over the best single edge."""
-    ends = source_id, target_id
-    known = [side.covariance(target_id, source_id)] if source_id.track == target_id.track else []
+def _sigmas_m(covariances: FloatArray) -> FloatArray:
+    return np.sqrt(np.maximum(0.0, np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1]))
+
+
+def _vague(
+    pairs: Sequence[Ends], limits_m: FloatArray, side: Side, edges: Sequence[Edge]
+) -> list[tuple[Ends, FloatArray, float]]:
+    """Of pairs, those that neither odometry nor any single edge makes as sure as their limits.
+
+    With each, the least covariance (3, 3), and the standard deviation [m] that it means.
+    """
+    by_tracks: dict[tuple[Track, Track], list[Edge]] = {}
     for edge in edges:
-        if (edge.source.track, edge.target.track) == (source_id.track, target_id.track):
-            known.append(pose_uncertainty(edge, ends, side, side))
-        elif (edge.target.track, edge.source.track) == (source_id.track, target_id.track):
-            known.append(pose_uncertainty(edge.reversed(), ends, side, side))
-    if not known:
-        known = [side.covariance(target_id, source_id)]
-    return min(known, key=sigma_m)
+        tracks = edge.source.track, edge.target.track
+        by_tracks.setdefault(tracks, []).append(edge)
+        if tracks[0] != tracks[1]:
+            by_tracks.setdefault(tracks[::-1], []).append(edge.reversed())
+    members: dict[tuple[Track, Track], list[int]] = {}
+    for index, (source_id, target_id) in enumerate(pairs):
+        members.setdefault((source_id.track, target_id.track), []).append(index)
+    found: list[tuple[Ends, FloatArray, float]] = []
+    for tracks, indices in members.items():
+        own, limits = [pairs[i] for i in indices], limits_m[indices]
+        joining = by_tracks.get(tracks, [])
+        if joining:
+            # Most are sure enough over the edge that is the fewest steps away.
+            steps = np.abs(_sequences(own)[:, None] - _sequences(_ends_of(joining))[None])
+            nearest = [joining[i] for i in steps.sum(axis=2).argmin(axis=1)]
+            is_vague = _sigmas_m(_uncertainties(nearest, own, side, side)) > limits
+            own = [ends for ends, is_open in zip(own, is_vague, strict=True) if is_open]
+            limits = limits[is_vague]
+        for ends, limit_m in zip(own, limits.tolist(), strict=True):
+            ways: list[FloatArray] = []
+            if not joining or tracks[0] == tracks[1]:
+                ways.append(side.covariance(ends[1], ends[0]))
+            if joining:
+                ways += [*_uncertainties(joining, [ends] * len(joining), side, side)]
+            sigmas = _sigmas_m(np.array(ways))
+            best = int(sigmas.argmin())
+            if sigmas[best] > limit_m:
+                found.append((ends, ways[best], float(sigmas[best])))
+    return found
+
+
+def _sequences(pairs: Sequence[Ends]) -> NDArray[np.int64]:
+    return np.array([(source_id.sequence, target_id.sequence) for source_id, target_id in pairs])
+
+
+def _ends_of(edges: Sequence[Edge]) -> list[Ends]:
+    return [(edge.source, edge.target) for edge in edges]
+
+
+class _Circles:
+    """Around what each submap of a side has seen."""
+
+    def __init__(self, library: Library, side: Side) -> None:
+        self._ids = [*side.T_frame_submap]
+        self._center = _stacked(side.T_frame_submap.values()).reshape(-1, 3)[:, :2]
+        self._radius_m = np.array([library.submaps[i].radius_m for i in self._ids])
+
+    def near(self, T_frame_submap: SE2, radius_m: float) -> list[SubmapId]:
+        """All that a circle around a pose may touch."""
+        x, y = (self._center - (T_frame_submap.x, T_frame_submap.y)).T
+        is_near = np.hypot(x, y) <= self._radius_m + (radius_m + _ROUNDING_M)
+        return [self._ids[i] for i in np.flatnonzero(is_near)]
 
 
 def _share(library: Library, source: SubmapId, target: SubmapId, T_target_source: SE2) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.merging.graph.components import Constraint
-from uw_dslam_ros2.core.merging.graph.library import Library, Memory
+from uw_dslam_ros2.core.merging.graph.library import Library
+from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
@@ -41,9 +43,8 @@ def implausible_submaps(
             if pieces:
                 before, after = submaps[pieces[-1][-1]], submaps[submap_id]
                 key = ("leap", before.fingerprint, after.fingerprint, submap_id)
-                if key not in memory:
-                    memory[key] = _leap(before.submap, after.submap, max_speed_m_s)
-                why = memory[key]
+                work = functools.partial(_leap, before.submap, after.submap, max_speed_m_s)
+                why = memory.remember(key, work)
             if why or not pieces:
                 pieces.append([])
                 reasons.append(why)

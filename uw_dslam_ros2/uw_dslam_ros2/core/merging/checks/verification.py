@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Container, Mapping, Sequence
 
@@ -98,6 +99,8 @@ class Verifier:
     def constraints_nearby(self, source: Side, target: Side) -> list[Constraint]:
         """Constraints between two tracks of one component, where the graph lets them meet."""
         checks = self._checks(None, None, SE2(), source, target)[:MAX_CHECKS]
+        if not checks:
+            return []
         replies = self._ask_all(checks)
         if replies is None:
             return []
@@ -143,7 +146,10 @@ class Verifier:
 
     def constraint(self, answer: Answer) -> Constraint:
         """The edge of an answer; see `constraint_of`."""
-        return constraint_of(self._library, answer)
+        library, query = self._library, answer.query
+        states = library.state_of(query.source), library.state_of(query.target)
+        key = "constraint", query.key, answer.T_target_source, answer.probability, states
+        return library.remember(key, lambda: constraint_of(library, answer))
 
     def ask(self, query: Query) -> Answer | None:
         """The answer, if there is one; otherwise the question is noted as wanted."""
@@ -173,6 +179,20 @@ class Verifier:
         target: Side,
     ) -> list[Query]:
         """Questions at the places where the two sides share most, away from each other."""
+        work = functools.partial(self._made_checks, query, main, T_target_source, source, target)
+        if query is None or main is None or source.key is None or target.key is None:
+            return work()
+        ends = main.source, main.target, main.T_target_source
+        return self._library.remember(("checks", query.key, ends, source.key, target.key), work)
+
+    def _made_checks(
+        self,
+        query: Query | None,
+        main: Edge | None,
+        T_target_source: SE2,
+        source: Side,
+        target: Side,
+    ) -> list[Query]:
         places = meetings(
             self._library,
             T_target_source,
@@ -220,7 +240,11 @@ class Verifier:
     def _weigh(
         self, votes: Sequence[Vote], num_checks: int, source: Side, target: Side
     ) -> tuple[list[Constraint], float]:
-        return weigh(votes, num_checks, source, target, INLIER_PROBABILITY)
+        work = functools.partial(weigh, votes, num_checks, source, target, INLIER_PROBABILITY)
+        if source.key is None or target.key is None:
+            return work()
+        said = tuple((v.constraint.key, v.constraint.edge.T_target_source) for v in votes)
+        return self._library.remember(("weigh", said, num_checks, source.key, target.key), work)
 
     def _ask_all(self, queries: Sequence[Query]) -> list[Answer] | None:
         """All answers, or None while one is missing."""

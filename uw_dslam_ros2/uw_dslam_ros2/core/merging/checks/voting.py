@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ import numpy as np
 
 from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.merging.graph.components import Constraint
-from uw_dslam_ros2.core.merging.graph.consistency import Side, consistent_set, cycle_of
+from uw_dslam_ros2.core.merging.graph.consistency import Side, consistent_set, cycles_of
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.pose_graph import chi2_threshold
 from uw_dslam_ros2.core.registration.result import PriorWindow
@@ -72,13 +73,10 @@ def weigh(
     has_accepted = any(votes[index].is_accepted for index in clique)
     believed: list[Constraint] = []
     odds = (1.0 - _PASS) ** (num_checks - sum(votes[i].prior is not None for i in clique))
+    chances = _coincidences(votes, edges, clique, source, target, inlier_probability)
     for place, index in enumerate(clique):
         vote = votes[index]
-        coincidences = {
-            other: _coincidence(edges, index, other, vote, source, target, inlier_probability)
-            for other in clique
-            if other != index
-        }
+        coincidences = {other: chances[index, other] for other in clique if other != index}
         lacking = 1.0 / max(vote.constraint.probability, 1e-9) - 1.0
         if (
             vote.is_accepted
@@ -93,25 +91,31 @@ def weigh(
     return believed, odds
 
 
-def _coincidence(
+def _coincidences(
+    votes: Sequence[Vote],
     edges: Sequence[Edge],
-    index: int,
-    other: int,
-    vote: Vote,
+    clique: Sequence[int],
     source: Side,
     target: Side,
     inlier_probability: float,
-) -> float:
-    """Share of the searched window in which a vote would agree with another one."""
-    if vote.prior is None:
-        return 1.0
-    _, covariance = cycle_of(edges[index], edges[other], source, target)
+) -> dict[tuple[int, int], float]:
+    """Share of the window that the first vote searched in which it would agree with the second."""
+    pairs = list(itertools.permutations(clique, 2))
+    _, covariances = cycles_of(edges, pairs, source, target)
     radius = math.sqrt(chi2_threshold(inlier_probability))
-    sigmas = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:2, :2]), 0.0))
-    sides_m = np.minimum(2.0 * radius * sigmas, 2.0 * vote.prior.half_width_m)
-    turn = min(radius * math.sqrt(float(covariance[2, 2])), vote.prior.half_width_rad)
-    window = 4.0 * vote.prior.half_width_m**2 * vote.prior.half_width_rad
-    return float(max(sides_m.prod() * turn / window, _LEAST_CHANCE))
+    sigmas = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[:, :2, :2]), 0.0))
+    turns = radius * np.sqrt(covariances[:, 2, 2])
+    found: dict[tuple[int, int], float] = {}
+    for pair, sigma, turn_rad in zip(pairs, sigmas, turns.tolist(), strict=True):
+        prior = votes[pair[0]].prior
+        if prior is None:
+            found[pair] = 1.0
+            continue
+        sides_m = np.minimum(2.0 * radius * sigma, 2.0 * prior.half_width_m)
+        turn = min(turn_rad, prior.half_width_rad)
+        window = 4.0 * prior.half_width_m**2 * prior.half_width_rad
+        found[pair] = float(max(sides_m.prod() * turn / window, _LEAST_CHANCE))
+    return found
 
 
 def _turned(edge: Edge, source: Side, target: Side) -> Edge:

@@ -6,6 +6,7 @@ largest set in which every pair closes (Mangelson et al. 2018) is taken for true
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,14 +17,14 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.pose_graph import (
     chi2_threshold,
-    compose_covariance,
+    compose_covariances,
     invert_covariance,
     mahalanobis,
 )
-from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.se2 import SE2, compose_poses, invert_poses
 from uw_dslam_ros2.core.submap import SubmapId
 
-__all__ = ["Side", "consistent_set", "cycle_distance", "cycle_of"]
+__all__ = ["Side", "consistent_set", "cycles_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -34,44 +35,66 @@ _MAX_CLIQUE_EDGES = 60
 class Side:
     """Submaps placed in one frame, and how sure their relative poses are.
 
-    ``covariance(target, source)`` (3, 3) is that of ``T_target_source``.
+    ``covariance(target, source)`` (3, 3) is that of ``T_target_source``. Sides of equal keys are
+    equal; None: nobody asks for the same one again.
     """
 
     T_frame_submap: Mapping[SubmapId, SE2]
     covariance: Callable[[SubmapId, SubmapId], FloatArray]
+    key: bytes | None = None
 
     def between(self, target: SubmapId, source: SubmapId) -> SE2:
         """``T_target_source`` of two members."""
         return self.T_frame_submap[target].inverse() @ self.T_frame_submap[source]
 
 
-def cycle_of(first: Edge, second: Edge, source: Side, target: Side) -> tuple[SE2, FloatArray]:
-    """By how much two edges from `source` to `target` fail to close, and covariance (3, 3)."""
-    forth, back = first.T_target_source, second.T_target_source.inverse()
+def cycles_of(
+    edges: Sequence[Edge], pairs: Sequence[tuple[int, int]], source: Side, target: Side
+) -> tuple[FloatArray, FloatArray]:
+    """By how much pairs of edges fail to close.
+
+    Parameters
+    ----------
+    edges
+        All from `source` to `target`.
+    pairs
+        Indices of P times two edges.
+    source, target
+        The two maps.
+
+    Returns
+    -------
+    tuple
+        Motions (P, 3) [x, y, yaw], and their covariances (P, 3, 3).
+    """
+    if not pairs:
+        return np.zeros((0, 3)), np.zeros((0, 3, 3))
+    first, second = np.array(pairs).T
+    motion = np.array([edge.T_target_source.as_array() for edge in edges])
+    covariance = np.array([edge.covariance for edge in edges])
+    T_source = np.array([source.T_frame_submap[edge.source].as_array() for edge in edges])
+    T_target = np.array([target.T_frame_submap[edge.target].as_array() for edge in edges])
     motions = [
-        forth,
-        source.between(first.source, second.source),
-        back,
-        target.between(second.target, first.target),
+        motion[first],
+        compose_poses(invert_poses(T_source[first]), T_source[second]),
+        invert_poses(motion)[second],
+        compose_poses(invert_poses(T_target[second]), T_target[first]),
     ]
+    back = np.array([invert_covariance(e.covariance, e.T_target_source) for e in edges])
     covariances = [
-        first.covariance,
-        source.covariance(first.source, second.source),
-        invert_covariance(second.covariance, second.T_target_source),
-        target.covariance(second.target, first.target),
+        covariance[first],
+        np.array([source.covariance(edges[i].source, edges[j].source) for i, j in pairs]),
+        back[second],
+        np.array([target.covariance(edges[j].target, edges[i].target) for i, j in pairs]),
     ]
-    total = np.zeros((3, 3))
-    left = SE2()
-    rights = [motions[1] @ motions[2] @ motions[3], motions[2] @ motions[3], motions[3], SE2()]
-    for motion, right, covariance in zip(motions, rights, covariances, strict=True):
-        total += compose_covariance(covariance, left, motion, right)
-        left = left @ motion
+    none = np.zeros((len(pairs), 3))
+    last = compose_poses(motions[2], motions[3])
+    rights = [compose_poses(motions[1], last), last, motions[3], none]
+    left, total = none, np.zeros((len(pairs), 3, 3))
+    for step, right, own in zip(motions, rights, covariances, strict=True):
+        total += compose_covariances(own, left, step, right)
+        left = compose_poses(left, step)
     return left, total
-
-
-def cycle_distance(first: Edge, second: Edge, source: Side, target: Side) -> float:
-    """Squared Mahalanobis distance by which two edges fail to close; see `cycle_of`."""
-    return mahalanobis(*cycle_of(first, second, source, target))
 
 
 def consistent_set(
@@ -100,9 +123,10 @@ def consistent_set(
     order = sorted(range(len(edges)), key=lambda i: (-weights[i], i))[:_MAX_CLIQUE_EDGES]
     for i in sorted(order):
         graph.add_node(i, weight=1 + round(1000 * weights[i]))
-    for i in graph:
-        for j in graph:
-            if i < j and cycle_distance(edges[i], edges[j], source, target) <= threshold:
-                graph.add_edge(i, j)
+    pairs = list(itertools.combinations(sorted(order), 2))
+    distances = mahalanobis(*cycles_of(edges, pairs, source, target))
+    graph.add_edges_from(
+        pair for pair, agrees in zip(pairs, distances <= threshold, strict=True) if agrees
+    )
     clique, _ = nx.max_weight_clique(graph, weight="weight")
     return sorted(clique)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Hashable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from uw_dslam_ros2.core.merging.graph.answers import Query
 from uw_dslam_ros2.core.merging.graph.components import Component, Constraint, solve_components
 from uw_dslam_ros2.core.merging.graph.consistency import Side
 from uw_dslam_ros2.core.merging.graph.descriptors import NO_SHAPE, MapShape, shape_of
+from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.odometry import Odometry
 from uw_dslam_ros2.core.merging.graph.submap_groups import (
     StoredSubmap,
@@ -33,16 +33,13 @@ from uw_dslam_ros2.core.merging.graph.submap_groups import (
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track
 
-__all__ = ["Library", "Memory", "milestone"]
+__all__ = ["Library", "milestone"]
 
 FloatArray = NDArray[np.float64]
-Memory = dict[Hashable, Any]
-"""Results by what they depend on; may be thrown away at any time."""
 
 _GROWTH = 1.5
 _PART_LENGTH = 6
 """Consecutive submaps in a part of a track's map that is matched by itself."""
-_MAX_MEMORY = 200_000
 
 
 def milestone(count: int) -> int:
@@ -76,20 +73,48 @@ class Library:
         memory: Memory,
     ) -> None:
         self.submaps, self.withdrawn = submaps, withdrawn
-        self.odometry = Odometry(submaps)
+        self.odometry = Odometry(submaps, memory)
         self._memory = memory
-        if len(memory) > _MAX_MEMORY:
-            memory.clear()
         self.active = {
             i: s for i, s in sorted(submaps.items()) if i not in withdrawn and len(s.footprint)
         }
         self._by_track: dict[Track, list[SubmapId]] = {}
         for submap_id in self.active:
             self._by_track.setdefault(submap_id.track, []).append(submap_id)
-        self._state = tuple(
-            (i, s.submap.T_odom_submap, s.submap.covariance.tobytes())
-            for i, s in sorted(submaps.items())
+        self._closed = {
+            track: [i for i in ids if self.active[i].submap.is_final] or ids
+            for track, ids in self._by_track.items()
+        }
+        out: dict[Track, list[int]] = {}
+        for submap_id in sorted(i for i in submaps if i in withdrawn):
+            out.setdefault(submap_id.track, []).append(submap_id.sequence)
+        # All that groups and sides of one track depend on, in short.
+        self._states = {
+            track: self.odometry.state(track) + repr(out.get(track)).encode()
+            for track in self._by_track
+        }
+        self._graph_state = self.odometry.states()
+        self._track_sides: dict[Track, Side] = {}
+        self._without: dict[tuple[Track, ...], Library] = {}
+
+    def without(self, tracks: Sequence[Track]) -> Library:
+        """The same without some tracks."""
+        key = tuple(tracks)
+        if key not in self._without:
+            kept = {i: s for i, s in self.submaps.items() if i.track not in key}
+            self._without[key] = Library(kept, self.withdrawn, self._memory)
+        return self._without[key]
+
+    def state_of(self, group: SubmapGroup) -> tuple[Hashable, ...]:
+        """What is known of the tracks of a group, in short: equal ones are known alike."""
+        tracks = self._memory.remember(
+            ("tracks", group.key), lambda: sorted({i.track for i in group.ids})
         )
+        return tuple(self._states.get(track) for track in tracks)
+
+    def remember[T](self, key: Hashable, work: Callable[[], T]) -> T:
+        """The result under a key that names all that it depends on."""
+        return self._memory.remember(key, work)
 
     def whole_groups(self) -> dict[Track, SubmapGroup]:
         """Each track's map up to its last milestone, of closed submaps where there are any."""
@@ -106,8 +131,7 @@ class Library:
 
     def closed(self, track: Track) -> list[SubmapId]:
         """A track's closed submaps; all of them where none is closed yet."""
-        ids = self._by_track[track]
-        return [i for i in ids if self.active[i].submap.is_final] or ids
+        return self._closed[track]
 
     def closed_group(self, track: Track) -> SubmapGroup:
         """All of a track's closed submaps."""
@@ -115,6 +139,10 @@ class Library:
 
     def window(self, submap_id: SubmapId) -> SubmapGroup:
         """A submap with its neighbours along its track."""
+        key = "window", self._states[submap_id.track], submap_id
+        return self._memory.remember(key, lambda: self._window(submap_id))
+
+    def _window(self, submap_id: SubmapId) -> SubmapGroup:
         ids = self.closed(submap_id.track)
         index = ids.index(submap_id)
         reach = NUM_NEIGHBOURS if len(ids) > 2 * NUM_NEIGHBOURS + 1 else 0
@@ -142,7 +170,10 @@ class Library:
 
     def track_side(self, track: Track) -> Side:
         """A track's closed submaps, placed by its own odometry."""
-        return self.side_of(self.closed(track))
+        if track not in self._track_sides:
+            side = self.side_of(self.closed(track))
+            self._track_sides[track] = replace(side, key=self._states[track])
+        return self._track_sides[track]
 
     def side_of(self, ids: Sequence[SubmapId]) -> Side:
         """Submaps of one track, placed by its own odometry."""
@@ -172,7 +203,7 @@ class Library:
 
     def why_too_large(self, group: SubmapGroup) -> str:
         """Why a group cannot be made one map; empty if it can."""
-        return self._remember(("size", group.key), lambda: self._why_too_large(group))
+        return self._memory.remember(("size", group.key), lambda: self._why_too_large(group))
 
     def _why_too_large(self, group: SubmapGroup) -> str:
         lattice = self.submaps[group.reference].submap.grid.spec
@@ -199,21 +230,17 @@ class Library:
         """Descriptor of the group's map."""
         if self.why_too_large(group):
             return NO_SHAPE
-        return self._remember(("shape", group.key), lambda: shape_of(self.render(group)))
+        return self._memory.remember(("shape", group.key), lambda: shape_of(self.render(group)))
 
     def rough_shape(self, track: Track) -> MapShape:
         """Descriptor of a track's map, as it was at its last milestone."""
         ids = self.closed(track)[: milestone(len(self.closed(track)))]
         key = ("rough", tuple((i, self.active[i].digest) for i in ids))
-        return self._remember(key, lambda: self.shape(self._odometry_group(ids)))
+        return self._memory.remember(key, lambda: self.shape(self._odometry_group(ids)))
 
     def shared_area_m2(self, source: SubmapId, target: SubmapId, T_target_source: SE2) -> float:
         """Area that two submaps have both seen."""
-        first, second = self.submaps[source], self.submaps[target]
-        if math.hypot(T_target_source.x, T_target_source.y) > first.radius_m + second.radius_m:
-            return 0.0
-        key = ("area", first.digest, second.digest, T_target_source)
-        return self._remember(key, lambda: shared_area_m2(first, second, T_target_source))
+        return shared_area_m2(self.submaps[source], self.submaps[target], T_target_source)
 
     def solve(
         self, anchor: SubmapId, constraints: Sequence[Constraint]
@@ -221,20 +248,19 @@ class Library:
         """Solve the pose graph; see `components.solve_components`."""
         # One answer may serve several matches; it is one edge.
         unique = {constraint.key: constraint for constraint in constraints}
-        key = ("graph", self._state, anchor, tuple(sorted(unique)))
+        key = self._graph_state, anchor, frozenset(unique)
         edges, own = self.odometry.edges, list(unique.values())
-        return self._remember(
+        return self._memory.remember_solution(
             key, lambda: solve_components(self.submaps, anchor, edges, own, INLIER_PROBABILITY)
         )
 
     def _odometry_group(
         self, ids: Sequence[SubmapId], reference: SubmapId | None = None
     ) -> SubmapGroup:
+        key = "group", self._states[ids[0].track], ids[0], ids[-1], reference
+        return self._memory.remember(key, lambda: self._made_group(ids, reference))
+
+    def _made_group(self, ids: Sequence[SubmapId], reference: SubmapId | None) -> SubmapGroup:
         members = [self.active[i] for i in ids]
         poses = [self.odometry.T_odom_submap(i) for i in ids]
         return SubmapGroup.of(members, poses, ids.index(reference) if reference else len(ids) // 2)
-
-    def _remember(self, key: Hashable, work: Any) -> Any:
-        if key not in self._memory:
-            self._memory[key] = work()
-        return self._memory[key]

@@ -7,6 +7,7 @@ registration more to hold on to.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -144,7 +145,7 @@ def shared_area_m2(source: StoredSubmap, target: StoredSubmap, T_target_source: 
     if len(source.footprint) == 0 or len(target.footprint) == 0:
         return 0.0
     reach = source.radius_m + target.radius_m
-    if T_target_source.x**2 + T_target_source.y**2 > reach**2:
+    if math.hypot(T_target_source.x, T_target_source.y) > reach:
         return 0.0
     grid = target.submap.grid
     cells = grid.spec.cells_of(T_target_source.apply(source.footprint))
