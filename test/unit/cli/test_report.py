@@ -18,7 +18,7 @@ from uw_dslam_ros2.cli.scoring import Scores, Truth, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.maps import read_map, write_map
 from uw_dslam_ros2.io.trajectories import write_tum
 
 FACTS = RunFacts(
@@ -87,8 +87,22 @@ def test_the_numbers_are_there_without_times(folder: Path) -> None:
     assert sum(report["verdicts"].values()) == report["num_registrations"]
 
 
+def test_walls_are_lines_that_know_when_they_were_last_seen(folder: Path) -> None:
+    features = json.loads((folder / "walls.geojson").read_text())["features"]
+    occupancy = read_map(folder / "global_map.yaml")
+    assert features
+    for feature in features:
+        points = np.reshape(feature["geometry"]["coordinates"], (-1, 2))
+        cells = occupancy.spec.cells_of(points)
+        assert (cells >= 0).all()
+        assert (cells < occupancy.spec.shape).all()
+        assert feature["properties"]["last_seen_s"] == missions.STAMPS[-1] / 1e9
+    dxf = (folder / "walls.dxf").read_text()
+    assert dxf.count("POLYLINE") == sum(f["properties"]["kind"] == "wall" for f in features)
+
+
 def test_pictures_are_not_empty(folder: Path) -> None:
-    for name in ("before_after", "trajectory_error"):
+    for name in ("before_after", "trajectory_error", "walls"):
         image = cv2.imread(str(folder / f"{name}.png"))
         assert image is not None
         assert image.shape[1] > 600

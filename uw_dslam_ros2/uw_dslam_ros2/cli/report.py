@@ -14,9 +14,11 @@ import jinja2
 from uw_dslam_ros2.cli import pictures
 from uw_dslam_ros2.cli.outcome import Outcome, json_bytes, write_outcome
 from uw_dslam_ros2.cli.scoring import Scores, Truth, score
+from uw_dslam_ros2.cli.wall_lines import walls_of, walls_picture
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.provenance import contradictions_png
+from uw_dslam_ros2.io.wall_files import dxf_bytes, walls_geojson_bytes
 
 __all__ = ["RunFacts", "headline", "whose_error", "write_report"]
 
@@ -55,7 +57,10 @@ def write_report(
     *,
     has_pictures: bool = True,
 ) -> Scores:
-    """Write the result folder: all of `write_outcome`, report.json, pictures and report.html."""
+    """Write the result folder: all of `write_outcome`, walls as lines, report and pictures.
+
+    ``walls.geojson`` and ``walls.dxf``, ``report.json``, ``*.png``, ``report.html``.
+    """
     scores = score(
         outcome.global_map,
         outcome.trajectories(),
@@ -63,9 +68,19 @@ def write_report(
         truth,
     )
     write_outcome(folder, outcome)
-    write_files({folder / "report.json": json_bytes(report_dict(outcome, facts, scores))})
+    walls, piers = walls_of(outcome)
+    write_files(
+        {
+            folder / "walls.geojson": walls_geojson_bytes(walls, piers),
+            folder / "walls.dxf": dxf_bytes(walls, piers),
+            folder / "report.json": json_bytes(report_dict(outcome, facts, scores)),
+        }
+    )
     if has_pictures:
         images = _draw(outcome, truth, scores)
+        if outcome.global_map is not None:
+            figure = walls_picture(outcome.global_map, walls, piers)
+            images["walls"] = pictures.png_bytes(figure)
         shown = images
         if outcome.provenance is not None:
             shown = images | {"global_map_contradictions": contradictions_png(outcome.provenance)}

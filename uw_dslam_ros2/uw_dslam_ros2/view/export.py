@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from uw_dslam_ros2.core.chart.lines import trace_walls
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.trajectories import PoseGraphEdge, g2o_bytes, invertible, tum_bytes
+from uw_dslam_ros2.io.wall_files import dxf_bytes, walls_geojson_bytes
 from uw_dslam_ros2.view.overview import Names
 from uw_dslam_ros2.view.showing import Showing
 
@@ -25,6 +27,7 @@ _README = """\
 Each folder holds one group of vehicles that share a frame; lengths are metres.
 map.yaml, map.pgm   as nav2's map_server reads them
 map.png, map.pgw    a picture and its world file, for GIS programs
+walls.*             walls as lines, for GIS programs and for drawing programs
 tracks.geojson      the vehicles' tracks; coordinates are metres of the group's frame
 *.tum               the tracks with times: seconds x y z qx qy qz qw
 graph.g2o           the pose graph, without edges that were found wrong
@@ -63,6 +66,9 @@ def _files(showing: Showing, group: int, records: list[SubmapRecord]) -> dict[st
             for path in write_map(Path(folder) / "map", occupancy):
                 files[path.name] = path.read_bytes()
         spec = occupancy.spec
+        walls, piers = trace_walls(occupancy)
+        files["walls.geojson"] = walls_geojson_bytes(walls, piers)
+        files["walls.dxf"] = dxf_bytes(walls, piers)
         files["map.pgw"] = _world_file(spec.resolution_m, spec.T_frame_grid.yaw, *_top_left(spec))
     tracks = _tracks(records, showing.names)
     for name, (stamps_ns, poses) in tracks.items():

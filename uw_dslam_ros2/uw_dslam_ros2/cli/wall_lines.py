@@ -1,0 +1,84 @@
+"""Walls of a run's map as lines: when they were last seen, and a picture of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.cli.map_drawing import (
+    legend_below,
+    scale_bar,
+    set_title,
+    show_map,
+    single_map,
+)
+from uw_dslam_ros2.cli.outcome import Outcome
+from uw_dslam_ros2.core.chart.lines import Pier, Wall, trace_walls
+from uw_dslam_ros2.core.grid import UNKNOWN, OccupancyMap
+from uw_dslam_ros2.core.merging import MapProvenance
+from uw_dslam_ros2.core.submap import Submap
+
+__all__ = ["last_seen_ns", "walls_of", "walls_picture"]
+
+_LINE_COLOR, _PIER_COLOR = "#D55E00", "#0072B2"
+
+
+def walls_of(outcome: Outcome) -> tuple[list[Wall], list[Pier]]:
+    """Walls and piers of the global map; none where there is no map."""
+    if outcome.global_map is None:
+        return [], []
+    ages = None
+    if outcome.provenance is not None:
+        submaps = [record.submap for record in outcome.records]
+        ages = last_seen_ns(outcome.global_map, outcome.provenance, submaps)
+    return trace_walls(outcome.global_map, ages)
+
+
+def last_seen_ns(
+    occupancy: OccupancyMap, provenance: MapProvenance, submaps: Sequence[Submap]
+) -> NDArray[np.int64]:
+    """When the walls (R, C) were last seen: the end of the latest submap that has the cell.
+
+    0 where no submap has it, and where there is no wall.
+    """
+    ends = {s.submap_id: int(s.trajectory_stamp_ns[-1]) for s in submaps if len(s.trajectory)}
+    latest = np.array(
+        [max((ends.get(i, 0) for i in ids), default=0) for ids in provenance.contributors],
+        dtype=np.int64,
+    )
+    walls = np.argwhere(occupancy.values > 50)
+    # The last pass draws its own map: its cells lie elsewhere in the same frame.
+    cells = provenance.spec.cells_of(occupancy.spec.centers_of(walls))
+    is_inside = ((cells >= 0) & (cells < provenance.spec.shape)).all(axis=1)
+    seen = np.zeros(occupancy.spec.shape, np.int64)
+    seen[tuple(walls[is_inside].T)] = latest[provenance.owners[tuple(cells[is_inside].T)]]
+    return seen
+
+
+def walls_picture(occupancy: OccupancyMap, walls: Sequence[Wall], piers: Sequence[Pier]) -> Figure:
+    """The lines over what of the map is water."""
+    figure, axes = single_map(occupancy.spec)
+    water = np.where(occupancy.values > 50, UNKNOWN, occupancy.values)
+    show_map(axes, OccupancyMap(occupancy.spec, water))
+    axes.add_collection(
+        LineCollection([wall.points for wall in walls], colors=_LINE_COLOR, linewidths=1.2)
+    )
+    if piers:
+        places = np.array([(pier.x, pier.y) for pier in piers])
+        axes.scatter(places[:, 0], places[:, 1], s=14, marker="s", color=_PIER_COLOR, zorder=3)
+    scale_bar(axes)
+    length_m = sum(wall.length_m for wall in walls)
+    set_title(axes, f"{len(walls)} walls, {length_m:.0f} m, and {len(piers)} piers")
+    legend_below(
+        axes,
+        [
+            Line2D([], [], color=_LINE_COLOR, label="wall"),
+            Line2D([], [], color=_PIER_COLOR, marker="s", linestyle="", label="pier"),
+        ],
+    )
+    return figure
