@@ -1,5 +1,6 @@
 """Sessions survive: a round trip changes nothing, and no interruption loses anything."""
 
+import math
 import os
 import signal
 import sqlite3
@@ -12,9 +13,13 @@ import pytest
 from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.errors import DataError
-from uw_dslam_ros2.core.merging import MapQueue, SubmapState
+from uw_dslam_ros2.core.merging import Decision, DecisionKind, MapQueue, SubmapState
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import read_map
-from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, load_session, save_session
+from uw_dslam_ros2.io.session import SESSION_FILE, load_session, save_session
+from uw_dslam_ros2.io.session_export import export_queue
+from uw_dslam_ros2.io.session_file import Record, opened, read_records, write_records
 from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
 
@@ -59,6 +64,55 @@ def test_a_saved_queue_comes_back_as_it_was(tmp_path):
     assert states["auv_3", 0, 2] is SubmapState.WITHDRAWN
 
 
+def test_what_people_decided_comes_back_in_order(tmp_path):
+    queue = filled()
+    answer_all(queue, KnowingMatcher(FLEET))
+    ends = {"source": SubmapId("auv_2", 0, 1), "target": SubmapId("auv_1", 0, 1)}
+    who = {"who": "Ann", "stamp_ns": 1_700_000_000_123_456_789}
+    motion = {"T_target_source": SE2(0.1, 12.0, 1e-3)}
+    place = {"place": SE2(512_345.25, 5_912_345.5, 0.2), "earth_frame": "EPSG:32632"}
+    kinds = DecisionKind
+    for decision in (
+        Decision(kinds.WITHDRAW, source=SubmapId("auv_3", 0, 2), **who),
+        Decision(kinds.FORBID, is_run=True, source=ends["source"], target=ends["target"]),
+        Decision(kinds.CONFIRM, sigma_m=0.5, sigma_rad=0.1, **ends, **motion),
+        Decision(kinds.REGISTER, half_width_m=2.0, half_width_rad=0.1, **ends, **motion),
+        Decision(kinds.PIN, source=ends["source"]),
+        Decision(
+            kinds.FIX, source=ends["source"], point=(1.0, 2.0), sigma_m=2.0, sigma_rad=math.inf,
+            **place,
+        ),
+        Decision(kinds.UNDO, undone=2, **who),
+        Decision(kinds.UNDO, undone=7, **who),
+    ):  # fmt: skip
+        queue.decide(decision)
+    save_session(tmp_path, queue)
+    again = load_session(tmp_path)
+    assert again.to_state().decisions == queue.to_state().decisions
+    assert again.decisions() == queue.decisions()
+    assert summary(again) == summary(queue)
+
+
+def test_a_session_from_before_there_were_decisions_is_read(tmp_path):
+    save_session(tmp_path, filled())
+    path = tmp_path / SESSION_FILE
+    with opened(path) as (connection, _):
+        records = read_records(connection)
+    held = {name: Record.of(content) for name, content in records.items()}
+    held["withdrawn", '["auv_3", 0, 2]'] = Record.of(b"")
+    write_records(path, held)
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA user_version = 2")
+    connection.close()
+    again = load_session(tmp_path)
+    states = {r.submap.submap_id: r.state for r in again.submaps()}
+    assert states["auv_3", 0, 2] is SubmapState.WITHDRAWN
+    save_session(tmp_path, again)
+    assert contents(load_session(tmp_path)) == contents(again)
+    with opened(path) as (_, version):
+        assert version == 3
+
+
 def test_saving_again_writes_only_what_is_new(tmp_path):
     queue = filled()
     save_session(tmp_path, queue)
@@ -83,7 +137,7 @@ def test_saving_again_writes_only_what_is_new(tmp_path):
 def contents(queue: MapQueue):
     state = queue.to_state()
     submaps = [(submap.submap_id, submap.grid.values.tobytes()) for submap in state.submaps]
-    return submaps, state.withdrawn, [answer.query.key for answer in state.answers]
+    return submaps, state.decisions, [answer.query.key for answer in state.answers]
 
 
 class InterruptedWriteError(Exception):

@@ -19,11 +19,11 @@ from uw_dslam_ros2.io.session import (
     SESSION_FILE,
     Session,
     SessionInUseError,
-    export_queue,
     has_session,
     load_session,
     save_session,
 )
+from uw_dslam_ros2.io.session_export import export_queue
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
 
 DATA = Path(__file__).parent / "data"

@@ -7,6 +7,7 @@ import pytest
 
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.merging.checks.places import meetings, pose_uncertainty, vague_places
+from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, shared_area_m2
@@ -23,7 +24,7 @@ def fleet():
 @pytest.fixture(scope="module")
 def library(fleet):
     stored = {i: StoredSubmap.of(s, 10**6) for i, s in fleet.submaps.items()}
-    return Library(stored, frozenset(), Memory())
+    return Library(stored, DecisionLog(), Memory())
 
 
 def test_what_is_asked_for_is_kept_and_the_rest_forgotten():

@@ -12,6 +12,7 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
 from uw_dslam_ros2.core.merging import planning as planning_module
 from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track
+from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.graph.components import Constraint
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
@@ -137,7 +138,7 @@ def judged(matches):
     fleet = fleet_of(4, 1)
     ids = sorted(fleet.submaps)
     library = Library(
-        {i: StoredSubmap.of(s, 10**6) for i, s in fleet.submaps.items()}, frozenset(), Memory()
+        {i: StoredSubmap.of(s, 10**6) for i, s in fleet.submaps.items()}, DecisionLog(), Memory()
     )
     constraints = [
         constraint(number, ids[a], ids[b], SE2(shift_m, 0.0))

@@ -31,7 +31,7 @@ from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
-from uw_dslam_ros2.io.session import UNSURE_EDGE
+from uw_dslam_ros2.io.session_export import UNSURE_EDGE
 from uw_dslam_ros2.io.trajectories import PoseGraphEdge, invertible, write_g2o, write_tum
 
 __all__ = ["Outcome", "RegistrationRow", "VehicleOutcome", "outcome_of", "write_outcome"]

@@ -15,9 +15,20 @@ from pathlib import Path
 
 from uw_dslam_ros2.core.errors import DataError
 
-__all__ = ["FIRST_VERSION", "VERSION", "Record", "opened", "read_records", "write_records"]
+__all__ = [
+    "FIRST_VERSION",
+    "VERSION",
+    "VERSIONS",
+    "Record",
+    "opened",
+    "read_records",
+    "write_records",
+]
 
-VERSION = 2
+VERSION = 3
+"""Written; whoever knows older ones only refuses it, rather than to lose what people decided."""
+VERSIONS = 2, VERSION
+"""Read, in the table below."""
 FIRST_VERSION = 1
 """Format of old files, without checksums, in four tables."""
 _OLD_TABLES = ("meta", "submaps", "withdrawn", "answers")
@@ -61,7 +72,7 @@ def opened(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
 
 
 def read_records(connection: sqlite3.Connection) -> dict[RecordName, bytes]:
-    """All records of a file of format `VERSION`.
+    """All records of a file of one of the formats `VERSIONS`.
 
     Raises
     ------
@@ -101,14 +112,15 @@ def write_records(path: Path, records: Mapping[RecordName, Record]) -> None:
         With the file as it was.
     """
     with opened(path) as (connection, version):
-        if version not in (0, FIRST_VERSION, VERSION):
-            raise DataError(f"{path} is a session of format {version}, expected {VERSION}")
+        if version not in (0, FIRST_VERSION, *VERSIONS):
+            raise DataError(f"{path} is a session of format {version}, expected up to {VERSION}")
         connection.execute("BEGIN IMMEDIATE")
         try:
-            if version != VERSION:
+            if version not in VERSIONS:
                 for table in _OLD_TABLES:
                     connection.execute(f"DROP TABLE IF EXISTS {table}")
                 connection.execute(_TABLE)
+            if version != VERSION:
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             _replace(connection, records)
             connection.execute("COMMIT")

@@ -1,6 +1,13 @@
 """Many submaps of many vehicles, in any order, into one map."""
 
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.decisions import (
+    Decision,
+    DecisionKind,
+    DecisionLog,
+    DecisionRecord,
+)
+from uw_dslam_ros2.core.merging.georeference import Georeference
 from uw_dslam_ros2.core.merging.graph.components import LoopError
 from uw_dslam_ros2.core.merging.growing_map import GrowingMap, GrowingMapConfig, MapChange
 from uw_dslam_ros2.core.merging.queue import MapQueue
@@ -18,6 +25,11 @@ from uw_dslam_ros2.core.merging.types import (
 __all__ = [
     "Constraint",
     "ConstraintKind",
+    "Decision",
+    "DecisionKind",
+    "DecisionLog",
+    "DecisionRecord",
+    "Georeference",
     "GrowingMap",
     "GrowingMapConfig",
     "LoopError",

@@ -19,7 +19,7 @@ class GlobalFrame:
 
     Of ``anchor_vehicle``'s first submap, else of that vehicle's whose name comes first; among
     several groups of joined vehicles, of the largest group. It moves only while no vehicles are
-    joined in it.
+    joined in it, or when a person says so.
 
     Parameters
     ----------
@@ -40,6 +40,23 @@ class GlobalFrame:
         """What a person should know of, since the last call: that it moved."""
         notices, self._notices = self._notices, []
         return notices
+
+    def hold(self, submap_id: SubmapId, stored: StoredSubmap) -> bool:
+        """Have it where a person wants it; True if that moves it."""
+        before, self.is_pinned = self.anchor, True
+        if submap_id == before:
+            return False
+        if before is not None:
+            self._notices.append(
+                f"the global frame is now that of {submap_id}, as a person decided; it was that "
+                f"of {before}"
+            )
+        self._pin(submap_id, stored)
+        return True
+
+    def release(self) -> None:
+        """No person wants it anywhere any more: the rule of the class decides."""
+        self.anchor, self.is_pinned = None, False
 
     def settle(self, plan: Plan, submaps: Mapping[SubmapId, StoredSubmap], is_open: bool) -> bool:
         """Have the frame where the class says; True if that moves it.

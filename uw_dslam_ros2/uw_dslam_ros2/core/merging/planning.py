@@ -9,8 +9,10 @@ from collections.abc import Set as AbstractSet
 from uw_dslam_ros2.core.merging.asking.growing import make_growing_plan
 from uw_dslam_ros2.core.merging.asking.pairwise import make_pairwise_plan
 from uw_dslam_ros2.core.merging.asking.plan import Plan, make_plan
+from uw_dslam_ros2.core.merging.by_hand import matches_by_hand
 from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track, implausible_submaps
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
+from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
@@ -33,13 +35,11 @@ class Planning:
         self.aside: dict[SubmapId, str] = {}
         """What the last plan leaves out, and why."""
 
-    def library(
-        self, submaps: Mapping[SubmapId, StoredSubmap], withdrawn: AbstractSet[SubmapId]
-    ) -> Library:
+    def library(self, submaps: Mapping[SubmapId, StoredSubmap], decisions: DecisionLog) -> Library:
         """All submaps but those that their own odometry shows to be impossible."""
         self._implausible = implausible_submaps(submaps, self._config.max_speed_m_s, self._memory)
         kept = {i: s for i, s in submaps.items() if i not in self._implausible}
-        return Library(kept, frozenset(withdrawn), self._memory)
+        return Library(kept, decisions, self._memory)
 
     def forget(self) -> None:
         """Work all out anew: a question has another answer than before."""
@@ -78,8 +78,10 @@ class Planning:
             whole, sound = plan, library
             while len(self._contradicting) < len(tracks) and not plan.wanted:
                 track = contradicting_track(sound, plan.constraints, min(sound.submaps))
-                if track is None:
-                    break
+                if track is None or any(
+                    track in (end.track for end in decision.pair) for decision in library.confirmed
+                ):
+                    break  # a person wants it in the map
                 self._contradicting.append(track)
                 sound = library.without(self._contradicting)
                 plan = plan_with(sound)
@@ -112,5 +114,9 @@ class Planning:
         if self._config.mode == "pairwise":
             known = [track for track in tracks if any(i.track == track for i in library.submaps)]
             return make_pairwise_plan(library, known, answers, anchor, is_growing=is_growing)
+        library.by_hand, wanted = matches_by_hand(library, answers, is_growing=is_growing)
         make = make_growing_plan if is_growing else make_plan
-        return make(library, answers, standing, anchor, self._config)
+        plan = make(library, answers, standing, anchor, self._config)
+        first = {query.key for query in wanted}
+        wanted += [query for query in plan.wanted if query.key not in first]
+        return dataclasses.replace(plan, wanted=wanted)

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.arrivals import Arrivals
 from uw_dslam_ros2.core.merging.asking.plan import Plan
+from uw_dslam_ros2.core.merging.by_hand import remarks, stated_pose
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MapQueueConfig
+from uw_dslam_ros2.core.merging.decisions import (
+    Decision,
+    DecisionKind,
+    DecisionLog,
+    DecisionRecord,
+)
 from uw_dslam_ros2.core.merging.frame import GlobalFrame
+from uw_dslam_ros2.core.merging.georeference import Georeference, georeference_of
 from uw_dslam_ros2.core.merging.global_map import GlobalMap, undrawable
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import LoopError, loop_errors
@@ -31,6 +40,8 @@ __all__ = ["MapQueue"]
 
 _REPLAN_SHARE = 0.125
 """Of a plan's questions: so many are answered before `next_requests` makes another plan."""
+_NOT_PAIRWISE = DecisionKind.FORBID, DecisionKind.CONFIRM, DecisionKind.REGISTER
+"""The paper's queue of maps takes nothing back, and has no graph to put a constraint into."""
 
 
 class MapQueue:
@@ -45,7 +56,7 @@ class MapQueue:
         self._config = config or MapQueueConfig()
         self._arrivals = Arrivals(self._config.max_submap_cells)
         self._submaps = self._arrivals.submaps
-        self._withdrawn: set[SubmapId] = set()
+        self._decisions = DecisionLog()
         self._frame = GlobalFrame(self._config.anchor_vehicle, self._config.resolution_m)
         self._planning = Planning(self._config)
         self._undrawn: tuple[Plan | None, dict[SubmapId, str]] = (None, {})
@@ -155,39 +166,85 @@ class MapQueue:
         """Answers had so far."""
         return len(self._answers)
 
-    def withdraw(self, submap_id: SubmapId) -> bool:
+    def decide(self, decision: Decision) -> Decision:
+        """Write down what a person decided; what follows is worked out anew.
+
+        Returns
+        -------
+        Decision
+            With its number.
+
+        Raises
+        ------
+        InvalidInputError
+            If it names a submap that never came, or undoes what is not in force.
+        """
+        for name in ("source", "target"):
+            end = getattr(decision, name)
+            if end is not None and end not in self._submaps:
+                raise InvalidInputError(f"decision.{name} is {end}, which was never received")
+        if self._config.mode == "pairwise" and decision.kind in _NOT_PAIRWISE:
+            raise InvalidInputError(
+                f"decision.kind is {decision.kind.name}, expected another in mode pairwise"
+            )
+        before, self._decisions = self._decisions, self._decisions.added(decision)
+        if before.pin is not None and self._decisions.pin is None:
+            self._frame.release()
+        if decision.kind is DecisionKind.UNDO:
+            # What stood because of it would go on to stand.
+            self._standing = frozenset()
+        self._change_submaps()
+        return list(self._decisions)[-1]
+
+    def stated_pose(self, source: SubmapId, target: SubmapId) -> tuple[SE2, float, float]:
+        """What the answers say of two submaps, for a person to confirm; see `by_hand`."""
+        return stated_pose(self._answers.values(), source, target)
+
+    def decisions(self) -> list[DecisionRecord]:
+        """All decisions in order, and what became of each."""
+        if not len(self._decisions):
+            return []
+        plan, found = self._plan(), self._georeference()
+        told = remarks(self._decisions, self._current_library(), plan, self._answers, found)
+        return [
+            DecisionRecord(d, self._decisions.undone_by(d.number) is None, told[d.number])
+            for d in self._decisions
+        ]
+
+    @property
+    def num_decisions(self) -> int:
+        """Decisions so far, those included that are undone."""
+        return len(self._decisions)
+
+    def georeference(self) -> Georeference | None:
+        """Where "map" lies on earth; None where the fixes do not say it."""
+        found = self._georeference()
+        return None if isinstance(found, str) else found
+
+    def withdraw(self, submap_id: SubmapId, who: str = "", stamp_ns: int = 0) -> bool:
         """Take a submap out of the map and out of matching until `restore`, also when sent again.
 
         False if there is no such submap.
         """
-        if submap_id not in self._submaps:
-            return False
-        if submap_id not in self._withdrawn:
-            self._withdrawn.add(submap_id)
-            self._change_submaps()
-        return True
+        return self._switch(DecisionKind.WITHDRAW, submap_id, who, stamp_ns)
 
-    def restore(self, submap_id: SubmapId) -> bool:
+    def restore(self, submap_id: SubmapId, who: str = "", stamp_ns: int = 0) -> bool:
         """Undo `withdraw`. False if there is no such submap."""
-        if submap_id not in self._submaps:
-            return False
-        if submap_id in self._withdrawn:
-            self._withdrawn.discard(submap_id)
-            self._change_submaps()
-        return True
+        return self._switch(DecisionKind.RESTORE, submap_id, who, stamp_ns)
 
     def submaps(self) -> list[SubmapRecord]:
         """All submaps, by vehicle, run and sequence."""
         answers = list(self._answers.values())
-        plan = self._plan()
+        plan, library = self._plan(), self._current_library()
         return records_of(
             self._submaps,
-            self._withdrawn,
+            self._decisions.withdrawn(self._submaps),
             plan,
             self._frame.anchor,
             answers,
             self._planning.aside,
             self._undrawable(),
+            [decision.edge() for decision in library.confirmed],
         )
 
     def take_notices(self) -> list[str]:
@@ -222,7 +279,8 @@ class MapQueue:
 
     def constraints(self) -> list[Constraint]:
         """All edges of the pose graph with what is left of them after optimisation."""
-        return constraints_of(self._plan())
+        plan = self._plan()
+        return constraints_of(plan, [d.edge() for d in self._current_library().confirmed])
 
     def loops(self) -> list[LoopError]:
         """Cycles of three and more submaps in the graph, and by how much each fails to close."""
@@ -274,7 +332,7 @@ class MapQueue:
         """Everything that has to be kept to go on later; see `from_state`."""
         return QueueState(
             tuple(self._submaps[i].submap for i in sorted(self._submaps)),
-            frozenset(self._withdrawn),
+            tuple(self._decisions),
             tuple(self._answers[key] for key in sorted(self._answers)),
             self._frame.anchor,
             self._frame.lattice,
@@ -290,7 +348,7 @@ class MapQueue:
         queue = cls(config)
         for submap in state.submaps:
             queue._arrivals.put(submap)
-        queue._withdrawn = set(state.withdrawn)
+        queue._decisions = DecisionLog(state.decisions)
         queue._answers = {answer.query.key: answer for answer in state.answers}
         queue._standing = frozenset(state.standing)
         queue._frame.anchor, queue._frame.lattice = state.anchor, state.lattice
@@ -299,13 +357,25 @@ class MapQueue:
         queue._next_request_id = state.next_request_id
         return queue
 
+    def _switch(self, kind: DecisionKind, submap_id: SubmapId, who: str, stamp_ns: int) -> bool:
+        if submap_id not in self._submaps:
+            return False
+        submap_id = SubmapId(*submap_id)
+        is_out = bool(self._decisions.withdrawn([submap_id]))
+        if is_out != (kind is DecisionKind.WITHDRAW):
+            self.decide(Decision(kind, who, stamp_ns, submap_id))
+        return True
+
+    def _georeference(self) -> Georeference | str:
+        return georeference_of(self._decisions.fixes, self._merged())
+
     def _merged(self) -> dict[SubmapId, SE2]:
         components = self._plan().components
         return components[0] if components and self._frame.anchor in components[0] else {}
 
     def _current_library(self) -> Library:
         if self._library is None:
-            self._library = self._planning.library(self._submaps, self._withdrawn)
+            self._library = self._planning.library(self._submaps, self._decisions)
         return self._library
 
     def _change_submaps(self) -> None:
@@ -333,7 +403,11 @@ class MapQueue:
             if not self._submaps:
                 return Plan([], [], [], [])
             library = self._current_library()
-            if self._frame.anchor not in library.submaps:
+            pin = self._decisions.pin
+            if pin in library.submaps:
+                assert pin is not None
+                self._note_frame(self._frame.hold(pin, library.submaps[pin]))
+            elif self._frame.anchor not in library.submaps:
                 self._note_frame(self._frame.choose(self._sound(library)))
             plan = self._planning.plan(
                 library,
@@ -348,7 +422,9 @@ class MapQueue:
             )
             self._plan_cache, self._questions = plan, plan.wanted
             is_open = self._is_growing or bool(plan.wanted) or bool(self._in_flight)
-            if self._note_frame(self._frame.settle(plan, self._sound(library), is_open)):
+            if pin not in library.submaps and self._note_frame(
+                self._frame.settle(plan, self._sound(library), is_open)
+            ):
                 self._plan_cache = None
                 return self._plan()
         return self._plan_cache
@@ -401,7 +477,7 @@ class MapQueue:
         if self._global_map is None:
             self._global_map = GlobalMap(self._frame.lattice, LOG_ODDS_MAX)
         if not self._is_drawn:
-            left_out = self._withdrawn | self._undrawable().keys()
+            left_out = self._decisions.withdrawn(merged) | self._undrawable().keys()
             shown = {i: T for i, T in merged.items() if i not in left_out}
             self._global_map.draw(self._submaps, shown)
             self._is_drawn = True

@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,
+    Edge,
     SubmapRecord,
     SubmapState,
 )
@@ -30,11 +31,12 @@ def records_of(
     answers: Sequence[Answer],
     aside: Mapping[SubmapId, str],
     undrawn: Mapping[SubmapId, str],
+    confirmed: Sequence[Edge],
 ) -> list[SubmapRecord]:
     """All submaps, by vehicle, run and sequence.
 
     `aside` and `undrawn` are those that are set aside, and those that are not in the map although
-    they are joined, with the reasons.
+    they are joined, with the reasons; `confirmed` is what a person says.
     """
     is_pinned = bool(plan.components) and anchor in plan.components[0]
     components = [*plan.components, *_groups_aside(submaps, aside)]
@@ -49,7 +51,7 @@ def records_of(
         elif submap_id in aside:
             state, reason = SubmapState.SET_ASIDE, aside[submap_id]
         elif component == 0:
-            state, reason = SubmapState.MERGED, _merge_reason(submap_id, anchor, plan)
+            state, reason = SubmapState.MERGED, _merge_reason(submap_id, anchor, plan, confirmed)
             if submap_id in undrawn:
                 reason = f"{reason}; {undrawn[submap_id]}"
         else:
@@ -79,7 +81,7 @@ def _groups_aside(
     return groups
 
 
-def constraints_of(plan: Plan) -> list[Constraint]:
+def constraints_of(plan: Plan, confirmed: Sequence[Edge]) -> list[Constraint]:
     """All edges of the pose graph with what is left of them after optimisation."""
     where = component_numbers(plan.components)
     found: list[Constraint] = []
@@ -87,6 +89,11 @@ def constraints_of(plan: Plan) -> list[Constraint]:
     edges += [
         (ConstraintKind.REGISTRATION, constraint.edge, constraint.is_inlier, constraint.is_unsure)
         for constraint in plan.constraints
+    ]
+    edges += [
+        (ConstraintKind.CONFIRMED, edge, True, False)
+        for edge in confirmed
+        if edge.source in where and edge.target in where
     ]
     for kind, edge, is_inlier, is_unsure in edges:
         is_joined = where[edge.source] == where[edge.target]
@@ -106,7 +113,9 @@ def constraints_of(plan: Plan) -> list[Constraint]:
     return found
 
 
-def _merge_reason(submap_id: SubmapId, anchor: SubmapId | None, plan: Plan) -> str:
+def _merge_reason(
+    submap_id: SubmapId, anchor: SubmapId | None, plan: Plan, confirmed: Sequence[Edge]
+) -> str:
     assert anchor is not None
     if submap_id == anchor:
         return "pins the global frame"
@@ -118,12 +127,16 @@ def _merge_reason(submap_id: SubmapId, anchor: SubmapId | None, plan: Plan) -> s
         if constraint.is_inlier
         and submap_id.track in (constraint.edge.source.track, constraint.edge.target.track)
     ]
-    ends = {i for constraint in own for i in (constraint.edge.source, constraint.edge.target)}
+    edges = [constraint.edge for constraint in own]
+    by_hand = [e for e in confirmed if submap_id.track in (e.source.track, e.target.track)]
+    ends = {i for edge in edges or by_hand for i in (edge.source, edge.target)}
     partners = {i.track for i in ends} - {submap_id.track}
     names = sorted({t.vehicle_id for t in partners if t.vehicle_id != submap_id.vehicle_id})
     if any(t.vehicle_id == submap_id.vehicle_id for t in partners):
         names.append("another run of its own")
     reason = f"registered with {', '.join(names)}"
+    if by_hand and not own:
+        reason = f"laid on {', '.join(names)} by a person"
     if own and all(constraint.is_unsure for constraint in own):
         reason += ", by several answers that are unsure alone and agree"
     return reason

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uw_dslam_ros2.core.grid import GridSpec
+from uw_dslam_ros2.core.merging.decisions import Decision
 from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
@@ -13,14 +14,15 @@ __all__ = ["QueueState"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueueState:
-    """What came in and what was decided by others; the map follows from it.
+    """What came in and what others decided; the map follows from it.
 
     Requests in flight are not part of it: after a restart they are asked again.
     """
 
     submaps: tuple[Submap, ...]
     """Newest revision of each, by vehicle, run and sequence."""
-    withdrawn: frozenset[SubmapId]
+    decisions: tuple[Decision, ...]
+    """What people decided, in order."""
     answers: tuple[Answer, ...]
     anchor: SubmapId | None
     """Submap that pins the global frame."""

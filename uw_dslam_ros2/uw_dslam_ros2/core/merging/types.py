@@ -45,6 +45,8 @@ class ConstraintKind(enum.IntEnum):
 
     ODOMETRY = 1
     REGISTRATION = 2
+    CONFIRMED = 3
+    """A person says so."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,7 +26,8 @@ from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
-from uw_dslam_ros2.io.session import SESSION_FILE, export_queue, has_session
+from uw_dslam_ros2.io.session import SESSION_FILE, has_session
+from uw_dslam_ros2.io.session_export import export_queue
 from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
 from uw_dslam_ros2.ros.convert.merging import answer_to_msg, record_to_msg
 from uw_dslam_ros2.ros.plumbing.qos import SERVICES

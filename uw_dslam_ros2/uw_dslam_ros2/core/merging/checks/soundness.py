@@ -87,7 +87,7 @@ def contradicting_track(
         if len(outliers) < max(_MIN_BROKEN, held + 1):
             continue  # even if all of them were its fault
         others = [constraint for constraint in constraints if track not in _ends(constraint)]
-        solved, _ = library.solve(anchor, others)
+        solved = [c for c in library.solve(anchor, others)[0] if track not in _ends(c)]
         broken = len(own) - held + _num_inliers(solved) - _num_inliers(others)
         if broken >= _MIN_BROKEN and broken > held:
             blame[track] = broken - held

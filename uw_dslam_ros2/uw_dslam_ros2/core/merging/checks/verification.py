@@ -127,6 +127,8 @@ class Verifier:
         groups: dict[frozenset[Track], list[Query]] = {}
         for ends, uncertainty in places:
             check = self._check(ends, side.between(ends[1], ends[0]), uncertainty)
+            if self._library.is_forbidden(check):
+                continue
             groups.setdefault(frozenset((ends[0].track, ends[1].track)), []).append(check)
         found: list[Constraint] = []
         for tracks, checks in sorted(groups.items(), key=lambda item: sorted(item[0])):
@@ -153,6 +155,9 @@ class Verifier:
 
     def ask(self, query: Query) -> Answer | None:
         """The answer, if there is one; otherwise the question is noted as wanted."""
+        if self._library.is_forbidden(query):
+            refused = RegistrationResult.refused(Verdict.CONTRADICTED, "forbidden by a person")
+            return Answer.of(query, refused)
         answer = self._book.find_similar(query)
         if answer is not None:
             return answer
@@ -181,9 +186,12 @@ class Verifier:
         """Questions at the places where the two sides share most, away from each other."""
         work = functools.partial(self._made_checks, query, main, T_target_source, source, target)
         if query is None or main is None or source.key is None or target.key is None:
-            return work()
-        ends = main.source, main.target, main.T_target_source
-        return self._library.remember(("checks", query.key, ends, source.key, target.key), work)
+            checks = work()
+        else:
+            ends = main.source, main.target, main.T_target_source
+            key = "checks", query.key, ends, source.key, target.key
+            checks = self._library.remember(key, work)
+        return [check for check in checks if not self._library.is_forbidden(check)]
 
     def _made_checks(
         self,

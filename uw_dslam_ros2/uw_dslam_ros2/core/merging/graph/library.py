@@ -16,6 +16,7 @@ from uw_dslam_ros2.core.merging.config import (
     MAX_MAP_SIDE,
     NUM_NEIGHBOURS,
 )
+from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.graph.answers import Query
 from uw_dslam_ros2.core.merging.graph.components import Component, Constraint, solve_components
 from uw_dslam_ros2.core.merging.graph.consistency import Side
@@ -60,8 +61,9 @@ class Library:
     ----------
     submaps
         All; withdrawn ones still carry their track's odometry.
-    withdrawn
-        Those that are neither matched nor drawn.
+    decisions
+        What people decided: the withdrawn ones are neither matched nor drawn, forbidden matches
+        do not count, confirmed ones are as sure as odometry.
     memory
         Kept from state to state by the caller.
     """
@@ -69,15 +71,23 @@ class Library:
     def __init__(
         self,
         submaps: Mapping[SubmapId, StoredSubmap],
-        withdrawn: frozenset[SubmapId],
+        decisions: DecisionLog,
         memory: Memory,
     ) -> None:
-        self.submaps, self.withdrawn = submaps, withdrawn
+        self.submaps, self.decisions = submaps, decisions
         self.odometry = Odometry(submaps, memory)
         self._memory = memory
+        withdrawn = decisions.withdrawn(submaps)
         self.active = {
             i: s for i, s in sorted(submaps.items()) if i not in withdrawn and len(s.footprint)
         }
+        self.confirmed = [
+            decision
+            for decision in decisions.confirmed
+            if all(end in self.active for end in decision.pair)
+        ]
+        self.by_hand: list[Constraint] = []
+        """Constraints in windows that a person laid; part of every graph that is solved."""
         self._by_track: dict[Track, list[SubmapId]] = {}
         for submap_id in self.active:
             self._by_track.setdefault(submap_id.track, []).append(submap_id)
@@ -102,7 +112,7 @@ class Library:
         key = tuple(tracks)
         if key not in self._without:
             kept = {i: s for i, s in self.submaps.items() if i.track not in key}
-            self._without[key] = Library(kept, self.withdrawn, self._memory)
+            self._without[key] = Library(kept, self.decisions, self._memory)
         return self._without[key]
 
     def state_of(self, group: SubmapGroup) -> tuple[Hashable, ...]:
@@ -201,6 +211,15 @@ class Library:
         """Whether all submaps of a question are still in use."""
         return all(i in self.active for i in (*query.source.ids, *query.target.ids))
 
+    def is_forbidden(self, query: Query) -> bool:
+        """Whether people do not want a question asked: a place, or all that there is in it."""
+        source, target = query.source, query.target
+        if query.prior is not None and self.decisions.is_forbidden(
+            source.reference, target.reference
+        ):
+            return True
+        return all(self.decisions.is_forbidden(s, t) for s in source.ids for t in target.ids)
+
     def why_too_large(self, group: SubmapGroup) -> str:
         """Why a group cannot be made one map; empty if it can."""
         return self._memory.remember(("size", group.key), lambda: self._why_too_large(group))
@@ -246,10 +265,17 @@ class Library:
         self, anchor: SubmapId, constraints: Sequence[Constraint]
     ) -> tuple[list[Constraint], list[Component]]:
         """Solve the pose graph; see `components.solve_components`."""
+        allowed = [
+            constraint
+            for constraint in constraints
+            if not self.decisions.is_forbidden(constraint.edge.source, constraint.edge.target)
+        ]
         # One answer may serve several matches; it is one edge.
-        unique = {constraint.key: constraint for constraint in constraints}
-        key = self._graph_state, anchor, frozenset(unique)
-        edges, own = self.odometry.edges, list(unique.values())
+        unique = {constraint.key: constraint for constraint in [*allowed, *self.by_hand]}
+        firm = tuple(decision.number for decision in self.confirmed)
+        key = self._graph_state, anchor, frozenset(unique), firm
+        edges = [*self.odometry.edges, *(decision.edge() for decision in self.confirmed)]
+        own = list(unique.values())
         return self._memory.remember_solution(
             key, lambda: solve_components(self.submaps, anchor, edges, own, INLIER_PROBABILITY)
         )

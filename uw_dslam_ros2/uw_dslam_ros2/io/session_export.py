@@ -1,0 +1,76 @@
+"""A queue as files for other programs."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from urllib.parse import quote
+
+from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue
+from uw_dslam_ros2.core.run_names import RunNames
+from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.provenance import write_provenance
+from uw_dslam_ros2.io.trajectories import PoseGraphEdge, invertible, write_g2o, write_tum
+
+__all__ = ["UNSURE_EDGE", "export_queue"]
+
+UNSURE_EDGE = "refused by itself; believed because others agree with it"
+"""Comment on an edge of a pose graph."""
+_MAX_NAME = 80
+
+
+def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
+    """Write a queue for other programs; missing folders are made.
+
+    ``map.{yaml,pgm,png}`` (global map), ``map_contradictions.png`` and ``map_provenance.npz`` (who
+    saw what, see `write_provenance`), ``submaps/<vehicle>_<sequence>.*`` (each in its own frame;
+    of a second run ``<vehicle>_run2_<sequence>.*``), ``trajectories/<vehicle>.tum`` (merged
+    vehicles, in "map"), ``graph.g2o`` (the global component, without the edges found wrong).
+    """
+    folder = Path(folder)
+    written: list[Path] = []
+    occupancy = queue.global_map()
+    if occupancy is not None:
+        written += write_map(folder / "map", occupancy)
+    provenance = queue.provenance()
+    if provenance is not None:
+        written += write_provenance(folder / "map", provenance)
+    records = queue.submaps()
+    names = RunNames(record.submap for record in records)
+    for record in records:
+        submap = record.submap
+        run = names.file(submap.submap_id.track, _file_name(submap.vehicle_id))
+        name = f"{run}_{submap.sequence:04d}"
+        written += write_map(folder / "submaps" / name, submap.grid)
+    for vehicle, (stamps_ns, poses) in queue.trajectories().items():
+        path = folder / "trajectories" / f"{_file_name(vehicle)}.tum"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        written.append(write_tum(path, stamps_ns, poses))
+    joined = [record for record in records if record.component == 0]
+    keys = {record.submap.submap_id: index for index, record in enumerate(joined)}
+    vertices = {keys[r.submap.submap_id]: r.T_component_submap for r in joined}
+    edges = [
+        PoseGraphEdge(
+            keys[c.target],
+            keys[c.source],
+            c.T_target_source,
+            invertible(c.covariance) if c.kind is ConstraintKind.ODOMETRY else c.covariance,
+            UNSURE_EDGE if c.is_unsure else "",
+        )
+        for c in queue.constraints()
+        if c.is_inlier and c.source in keys and c.target in keys
+    ]
+    return [*written, write_g2o(folder / "graph.g2o", vertices, edges)]
+
+
+def _file_name(vehicle_id: str) -> str:
+    """Name for a vehicle's files: different for different vehicles, short, and in its folder."""
+    # Percent signs come from quoting alone, hence mark what stands for more than itself.
+    name = quote(vehicle_id, safe="")
+    if name.startswith("."):
+        name = f"%2E{name[1:]}"
+    if len(name) > _MAX_NAME:
+        name = (
+            f"{name[:_MAX_NAME]}%{hashlib.blake2b(vehicle_id.encode(), digest_size=8).hexdigest()}"
+        )
+    return name or "%"
