@@ -1,18 +1,14 @@
 """Build description of the ament_python package uw_dslam_ros2."""
 
+import runpy
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = "uw_dslam_ros2"
-NODES = (
-    "sonar_mapper",
-    "registration_server",
-    "map_queue_manager",
-    "bag_player",
-    "acoustic_link",
-    "channel",
-)
+# From beside this file: it is run from other folders, too.
+NODES = runpy.run_path(str(Path(__file__).resolve().parent / NAME / "node_names.py"))["NODES"]
 COMMANDS = (
     "simulate",
     "offline",
@@ -22,7 +18,6 @@ COMMANDS = (
     "evaluate",
     "study",
     "convert",
-    "view",
 )
 
 setup(
@@ -38,6 +33,7 @@ setup(
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
         (f"share/{NAME}/rviz", sorted(glob("rviz/*.rviz"))),
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{NAME}/config/systemd", sorted(glob("config/systemd/*"))),
     ],
     install_requires=["setuptools"],
     zip_safe=True,
@@ -47,7 +43,9 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            *(f"{node} = {NAME}.ros.start:{node}" for node in NODES),
+            # The view of a running graph is a command that shows saved results, too.
+            *(f"{node} = {NAME}.ros.start:{node}" for node in NODES if node != "view"),
+            f"view = {NAME}.cli.view:main",
             *(f"{command} = {NAME}.cli.{command}:main" for command in COMMANDS),
         ],
     },

@@ -10,7 +10,7 @@ import rclpy
 import yaml
 
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.io import settings as settings_files
+from uw_dslam_ros2.node_names import NODES as NODES_WITH_SETTINGS
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
 from uw_dslam_ros2.ros.nodes.sonar_mapper import SonarMapper
@@ -122,7 +122,7 @@ def _rows(tables):
 
 
 def test_a_settings_file_may_name_every_node_that_has_settings():
-    assert set(settings_files.NODES) == set(NODE_CONFIGS)
+    assert set(NODES_WITH_SETTINGS) == set(NODE_CONFIGS)
 
 
 @pytest.mark.parametrize("name", NODES)

@@ -25,8 +25,9 @@ import yaml
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
+from uw_dslam_ros2.node_names import NODES
 
-__all__ = ["NODES", "REMOVED", "SECTIONS", "SettingsFile"]
+__all__ = ["REMOVED", "SECTIONS", "SettingsFile"]
 
 SECTIONS = ("mapper", "registration", "points", "queue", "maps", "topics", "conventions")
 """Groups of settings that are part of the core; everything else concerns a node alone."""
@@ -79,15 +80,6 @@ REMOVED = {
 }
 """Settings of earlier versions, and what became of them."""
 
-NODES = (
-    "sonar_mapper",
-    "registration_server",
-    "map_queue_manager",
-    "bag_player",
-    "acoustic_link",
-    "channel",
-    "view",
-)
 _SENSOR_SETTINGS = {field.name for field in fields(SensorConfig)}
 _EVERY_NODE = "/**"
 _PARAMETERS = "ros__parameters"

@@ -2,49 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import signal
+from collections.abc import Callable
 from typing import Any
 
-__all__ = [
-    "acoustic_link",
-    "bag_player",
-    "channel",
-    "map_queue_manager",
-    "registration_server",
-    "sonar_mapper",
-]
+from uw_dslam_ros2.node_names import NODES
 
 
-def acoustic_link() -> int:
-    """See `nodes.acoustic_link`."""
-    return _run("acoustic_link")
-
-
-def bag_player() -> int:
-    """See `nodes.bag_player`."""
-    return _run("bag_player")
-
-
-def channel() -> int:
-    """See `nodes.channel`."""
-    return _run("channel")
-
-
-def map_queue_manager() -> int:
-    """See `nodes.map_queue_manager`."""
-    return _run("map_queue_manager")
-
-
-def registration_server() -> int:
-    """See `nodes.registration_server`."""
-    return _run("registration_server")
-
-
-def sonar_mapper() -> int:
-    """See `nodes.sonar_mapper`."""
-    return _run("sonar_mapper")
+def __getattr__(name: str) -> Callable[[], int]:
+    """The command of each node, by its name."""
+    if name not in NODES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return functools.partial(_run, name)
 
 
 def _run(name: str) -> int:

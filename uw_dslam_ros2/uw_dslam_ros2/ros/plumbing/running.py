@@ -17,6 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 
 from uw_dslam_ros2.core.errors import UwDslamError
+from uw_dslam_ros2.ros.plumbing.heartbeat import Heartbeat
 
 __all__ = ["run_node"]
 
@@ -68,8 +69,12 @@ def run_node(name: str, make_node: Callable[[], Node], argv: Sequence[str] | Non
         node = make_node()
         executor = MultiThreadedExecutor(getattr(node, "num_threads", 4))
         executor.add_node(node)
+        heartbeat = Heartbeat()
+        heartbeat.is_ready()
         while not is_stopped.is_set():
+            heartbeat.beat()
             executor.spin_once(timeout_sec=_LOOK_UP_S)
+        heartbeat.is_stopping()
         if hasattr(node, "stop"):
             node.stop()
         _let_callbacks_end(executor)
