@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from unit.cli import missions
 
 from uw_dslam_ros2.cli import offline
 from uw_dslam_ros2.io.bags import BagWriter, open_bag
@@ -96,6 +97,13 @@ def test_vehicles_are_found_and_can_be_named(mission) -> None:
     assert findings == []
     (named,), _ = find_recordings([], named={"mine": [mission.bags[0]]})
     assert (named.vehicle_id, named.namespace) == ("mine", mission.vehicle_ids[0])
+
+
+def test_a_vehicle_without_a_place_in_the_common_map_is_told() -> None:
+    (finding,) = offline.left_out(missions.outcome())
+    assert (finding.kind, finding.vehicle_id) == ("not_merged", "auv_3")
+    assert finding.severity == "warning"
+    assert "2%" in finding.sentence  # the verdict's own reason
 
 
 def test_no_sonar_is_no_map(mission, tmp_path, capsys) -> None:

@@ -12,17 +12,18 @@ from pathlib import Path
 from uw_dslam_ros2.cli.charting import charted
 from uw_dslam_ros2.cli.common import parser_for, progress_bar, run_command, versions
 from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recordings, sensor_config, settle
-from uw_dslam_ros2.cli.outcome import outcome_of
+from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
 from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
 from uw_dslam_ros2.cli.scoring import Truth, read_truth
 from uw_dslam_ros2.core.errors import ConfigError, DataError, NothingMappedError
+from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
 from uw_dslam_ros2.io.session import SESSION_FOLDER, save_session
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import find_recordings
 
-__all__ = ["main"]
+__all__ = ["left_out", "main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -118,6 +119,8 @@ def _run(args: argparse.Namespace) -> int:
         settle(queue, config.registration, progress)
     merged_s = time.monotonic()
 
+    outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
+    findings += left_out(outcome)
     facts = RunFacts(
         title=args.title or "offline: " + ", ".join(vehicles),
         source=[bag.name for bag in bags],
@@ -131,7 +134,6 @@ def _run(args: argparse.Namespace) -> int:
     )
     for note in facts.notes:
         print(f"warning: {note}", file=sys.stderr, flush=True)
-    outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
     pings = {key: own for made in mapped for key, own in made.pings.items()}
     outcome = charted(outcome, pings, config.mapper[mapped[0].vehicle_id].occupancy)
     save_session(args.out / SESSION_FOLDER, queue)  # for view, and to go on from
@@ -144,6 +146,26 @@ def _run(args: argparse.Namespace) -> int:
     print(headline(outcome, scores))
     print(f"results in {args.out}" + ("" if args.no_report else f", see {args.out}/report.html"))
     return 0
+
+
+def left_out(outcome: Outcome) -> list[Finding]:
+    """What of the vehicles has no place in the common map."""
+    found = []
+    for vehicle in outcome.vehicles:
+        num_left = vehicle.num_submaps - vehicle.num_merged
+        if not num_left:
+            continue
+        what = f"{num_left} of its submaps have" if vehicle.is_merged else "it has"
+        found.append(
+            Finding(
+                "partly_merged" if vehicle.is_merged else "not_merged",
+                "",
+                f"{what} no place in the common map, for no registration is sure enough "
+                f"({vehicle.reason}); does it see walls that others see?",
+                vehicle_id=vehicle.vehicle_id,
+            )
+        )
+    return found
 
 
 def _named_bags(options: Sequence[str]) -> dict[str, list[Path]]:
