@@ -249,6 +249,30 @@ def test_of_a_truncated_bag_what_is_readable_is_read(tmp_path, storage, keep):
         assert 0.5 * keep * num_imu <= len(stamps) <= num_imu
 
 
+def test_what_a_stopped_driver_repeats_under_new_stamps_is_left_out_and_told(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        messages = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+        writer.add_topic("/auv_1/dvl", "marine_acoustic_msgs/msg/Dvl")
+        for k in range(20):
+            stamp_ns = (k + 1) * SECOND
+            image = sonar_image(stamp_ns, np.uint16, 50, 40)
+            image.intensity[0, 0] = min(k, 10)
+            writer.write("/auv_1/sonar", stamp_ns, messages.sonar_image("auv_1/sonar", image))
+            velocity = (min(k, 10) + 0.5, 0.0)
+            content = messages.dvl(stamp_ns, "auv_1/dvl", velocity, 1e-4, 3.0)
+            writer.write("/auv_1/dvl", stamp_ns, content)
+    (recording,) = recordings_of([tmp_path / "bag"])
+    with VehicleReader(recording) as reader:
+        events = list(reader.events())
+    images = [e.image.intensity[0, 0] for e in events if isinstance(e, ImageEvent)]
+    speeds = [e.velocity_m_s[0] for e in events if isinstance(e, VelocityEvent)]
+    assert images == list(range(11))
+    # A few repetitions are usual, where a driver publishes faster than it measures.
+    assert speeds == [*(k + 0.5 for k in range(11)), 10.5, 10.5, 10.5]
+    assert [finding.kind for finding in reader.findings] == ["sonar_frozen", "dvl_frozen"]
+
+
 def test_empty_bag(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")

@@ -225,7 +225,8 @@ def map_recording(
         has_yaw_rate=has_yaw_rate,
     )
     findings = [
-        dataclasses.replace(finding, vehicle_id=recording.vehicle_id) for finding in findings
+        dataclasses.replace(finding, vehicle_id=recording.vehicle_id)
+        for finding in (*findings, *reader.findings)
     ]
     return VehicleSubmaps(
         recording.vehicle_id,
@@ -233,7 +234,6 @@ def map_recording(
         diagnostics,
         (
             *findings,
-            *reader.findings,
             *mountings.findings(recording.vehicle_id),
             *health_findings(vehicle),
         ),

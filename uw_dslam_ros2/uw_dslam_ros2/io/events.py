@@ -20,6 +20,7 @@ from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io import messages
 from uw_dslam_ros2.io.conventions import correct
 from uw_dslam_ros2.io.drivers import ADAPTERS, ReadSettings
+from uw_dslam_ros2.io.frozen import FrozenSensors
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
     Event,
@@ -217,6 +218,7 @@ class VehicleReader:
         """
         number = dict.fromkeys(self._recording.topics, 0)
         last: dict[str, bytes] = {}
+        frozen = FrozenSensors()
         for index, raw in merged(self._readers, self._sensor_topics()):
             role = self._roles[raw.topic]
             count = self.counts[role]
@@ -239,10 +241,13 @@ class VehicleReader:
                 count.num_bad += 1
                 count.problem = count.problem or text
                 continue
+            if not self._is_strict and frozen.is_frozen(found):
+                continue
             usual = [correct(event, self.conventions) for event in found]
             kept = [event for event in usual if event is not None]
             count.num_empty += not kept
             yield from kept
+        self.findings += frozen.findings()
 
     def _read(
         self, reader: BagReader, raw: RawMessage, role: str, stamp_ns: int | None
