@@ -68,6 +68,16 @@ def test_ranges_may_fall():
     target_at(30.0, 3.0, event)
 
 
+def test_ranges_in_millimetres_become_metres():
+    msg, told = projected(X_FORWARD, one_target((4, 2), 1, 0)), []
+    metres = np.array(msg.ranges)
+    msg.ranges = metres * 1000.0
+    settings = ReadSettings(tell=told.append)
+    (event,) = read("marine_acoustic_msgs/msg/ProjectedSonarImage", msg, settings)
+    np.testing.assert_allclose(event.image.range_m, metres)
+    assert [finding.kind for finding in told] == ["sonar_range_unit"]
+
+
 def test_pixels_that_are_no_number_hold_nothing():
     pixels = one_target((4, 2), 2, 0, np.float32)
     pixels[0] = np.nan

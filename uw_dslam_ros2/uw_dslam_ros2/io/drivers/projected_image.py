@@ -23,6 +23,14 @@ __all__ = ["ADAPTERS", "read_projected", "read_raw"]
 _PIXEL_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _NUM_IMAGES = 10  # that are asked for the order of their bytes
 _CLEARLY = 0.3
+_FARTHEST_M = 2000.0
+"""No sonar that is mapped with sees farther; ranges that do are in millimetres."""
+_MILLIMETRES = Finding(
+    "sonar_range_unit",
+    "sonar",
+    "its ranges go beyond 2000: they are taken for millimetres, where the message has metres; "
+    "mend the driver",
+)
 _BY_BEAM = Finding(
     "sonar_data_order",
     "sonar",
@@ -50,6 +58,9 @@ def read_projected(msg: Any, settings: ReadSettings) -> Sequence[ImageEvent]:
     steps = np.diff(range_m)
     if not (np.isfinite(range_m).all() and ((steps > 0.0).all() or (steps < 0.0).all())):
         raise InvalidInputError("ranges are not finite and rising (or falling)")
+    if range_m.max() > _FARTHEST_M:
+        settings.tell_once(_MILLIMETRES)
+        range_m = range_m * 1e-3
     bearing_rad, forward = _bearings(directions)
     return (_image_event(msg, settings, range_m, bearing_rad, forward),)
 
