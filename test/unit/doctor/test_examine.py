@@ -89,7 +89,9 @@ CASES = {
     "dvl_turned": (dvl(lambda _, v: turned(v, -0.8)), {"velocity_yaw_offset_rad": 0.8}),
     "dvl_mirrored": (dvl(lambda _, v: v * [1.0, -1.0]), {"velocity_is_mirrored": True}),
     "dvl_unit": (dvl(lambda _, v: 1000.0 * v), {"velocity_scale": 0.001}),
-    "scale": (dvl(lambda _, v: 1.05 * v), {}),
+    "dvl_scale": (dvl(lambda _, v: 1.05 * v), {"velocity_scale": 1.0 / 1.05}),
+    "sound_speed": (sonar(lambda p: 1.05 * p), {"sonar_range_scale": 1.0 / 1.05}),
+    "dvl_constant": (dvl(lambda _, v: 0.0 * v), {"velocity_zero_is_invalid": True}),
     "dvl_zero_without_lock": (dvl(without_lock), {"velocity_zero_is_invalid": True}),
     "sonar_mirrored": (sonar(lambda p: p * [1.0, -1.0]), {"sonar_is_mirrored": True}),
     "sonar_turned": (sonar(lambda p: turned(p, 1.6)), {"sonar_yaw_offset_rad": -1.6}),
@@ -110,7 +112,7 @@ def test_the_cause_is_named_and_mended(recording, kind):
     assert set(changes) == set(mends)
     for name, value in mends.items():
         # This vehicle's speed hardly changes, and so hardly shows when it did.
-        tolerance = 0.15 if name == "velocity_delay_s" else 0.03
+        tolerance = {"velocity_delay_s": 0.15, "sonar_range_scale": 0.015}.get(name, 0.03)
         assert changes[name] == pytest.approx(value, abs=tolerance)
 
 

@@ -212,7 +212,9 @@ CORRUPTIONS: dict[str, Corruption] = {
     "dvl in mm/s": Corruption(
         ("dvl_unit",), _velocity(1000.0 * np.eye(2)), {"velocity_scale": 0.001}
     ),
-    "dvl 4 % long": Corruption(("scale",), _velocity(1.04 * np.eye(2))),
+    "dvl 4 % long": Corruption(
+        ("dvl_scale",), _velocity(1.04 * np.eye(2)), {"velocity_scale": 1.0 / 1.04}
+    ),
     "zeros without lock": Corruption(
         ("dvl_zero_without_lock",), _without_lock, {"velocity_zero_is_invalid": True}
     ),
@@ -232,7 +234,9 @@ CORRUPTIONS: dict[str, Corruption] = {
     "bytes beam by beam": Corruption((), _message(data_order="beam_major")),
     "bytes swapped": Corruption(("sonar_byte_order",), _message(is_swapped=True)),
     "power for amplitude": Corruption(("sonar_power",), _image(intensity=_as_power)),
-    "speed of sound 4 % off": Corruption(("scale",), _image(range_scale=1.04)),
+    "speed of sound 4 % off": Corruption(
+        ("sound_speed",), _image(range_scale=1.04), {"sonar_range_scale": 1.0 / 1.04}
+    ),
     "imu 0.8 s late": _late("imu", 0.8, "imu_delay_s"),
     "dvl 0.8 s late": _late("velocity", 0.8, "velocity_delay_s"),
     "sonar 0.4 s late": _late("sonar", 0.4, "sonar_delay_s"),

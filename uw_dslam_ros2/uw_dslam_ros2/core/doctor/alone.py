@@ -17,6 +17,7 @@ __all__ = ["judge_imu", "without_zeros"]
 _SWING_RAD = math.radians(8.6)
 _ZEROS_IN_A_ROW = 3
 _MOVES_M_S = 0.15
+_MIN_VELOCITIES = 20
 _LEAST_DISTINCT = 0.05  # of measured velocities; of commanded ones a few in a thousand are
 
 
@@ -94,6 +95,8 @@ def without_zeros(
     Velocities that were commanded, not measured, repeat a few values: their zeros are stops.
     """
     velocity = navigation.velocity_m_s
+    if len(velocity) >= _MIN_VELOCITIES and not np.ptp(velocity, axis=0).any():
+        return _without_constant(result, navigation, vehicle_id)
     is_zero = ~velocity.any(axis=1)
     moving = velocity[~is_zero]
     if len(np.unique(moving, axis=0)) < _LEAST_DISTINCT * len(moving):
@@ -124,3 +127,24 @@ def without_zeros(
     return replace(
         navigation, velocity_s=navigation.velocity_s[~is_zero], velocity_m_s=velocity[~is_zero]
     )
+
+
+def _without_constant(
+    result: Examination, navigation: NavigationSample, vehicle_id: str
+) -> NavigationSample:
+    """Tell of velocities that are all the same, and drop them: nothing is measured so."""
+    forward, left = (float(v) for v in navigation.velocity_m_s[0])
+    is_zero = not navigation.velocity_m_s.any()
+    mend = " (conventions.velocity_zero_is_invalid: true)" if is_zero else ""
+    result.add(
+        Finding(
+            "dvl_constant",
+            "velocity",
+            f"all its {len(navigation.velocity_m_s)} velocities are ({forward:.2f}, {left:.2f}) "
+            f"m/s to the last digit: its driver does not fill them, or the dvl is off{mend}",
+            vehicle_id=vehicle_id,
+        ),
+        **({"velocity_zero_is_invalid": True} if is_zero else {}),
+    )
+    none = navigation.velocity_s[:0], navigation.velocity_m_s[:0]
+    return replace(navigation, velocity_s=none[0], velocity_m_s=none[1])

@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.doctor.fits import TurnFit, VelocityFit, confidence_of
 
 __all__ = ["Delays", "find_delays"]
 
-_MAX_DELAY_S = 1.5
+_MAX_DELAY_S = 2.3
 _COARSE_S, _FINE_S = 0.1, 0.02
 _MIN_TURN_DELAY_S = 0.08
 _MIN_WAY_DELAY_S = 0.2  # a DVL's own filter takes up to that, and it costs a map nothing

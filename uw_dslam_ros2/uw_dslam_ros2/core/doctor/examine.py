@@ -330,15 +330,30 @@ class _Trial:
                 velocity_scale=float(f"{factor:.4g}"),
             )
             return
-        percent = 100.0 * (1.0 / fit.scale - 1.0)
+        confidence = _confidence_in(error - 0.5 * _MIN_SCALE_ERROR, sigma)
+        # Only the ratio shows. Instruments are set for the sea, 1500 m/s; colder or fresher water
+        # makes one that is not set for it measure too long, and hardly any water too short.
+        if fit.scale > 1.0:
+            self._add(
+                "sound_speed",
+                "sonar",
+                f"its echoes move {100.0 * (fit.scale - 1.0):.1f} % farther than the dvl says, as "
+                "with a speed of sound that is too high for colder or fresher water "
+                f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f}); or the dvl's scale is "
+                f"too small (conventions.velocity_scale: {fit.scale:.3f} instead)",
+                confidence,
+                sonar_range_scale=round(1.0 / fit.scale, 4),
+            )
+            return
         self._add(
-            "scale",
+            "dvl_scale",
             "velocity",
-            f"its way is {abs(percent):.1f} % {'longer' if percent > 0.0 else 'shorter'} than the "
-            "sonar's echoes move: either the dvl's scale is wrong "
-            f"(conventions.velocity_scale: {fit.scale:.3f}), or the sonar's speed of sound "
-            f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f})",
-            _confidence_in(error - 0.5 * _MIN_SCALE_ERROR, sigma),
+            f"its way is {100.0 * (1.0 / fit.scale - 1.0):.1f} % longer than the sonar's echoes "
+            "move, as with a speed of sound that is too high for colder or fresher water "
+            f"(conventions.velocity_scale: {fit.scale:.3f}); or the sonar's is too low "
+            f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f} instead)",
+            confidence,
+            velocity_scale=round(fit.scale, 4),
         )
 
     # --- time

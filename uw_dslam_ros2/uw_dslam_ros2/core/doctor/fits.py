@@ -103,7 +103,7 @@ def _turn_cost(
 
 
 def fit_turns(
-    motions: PingMotions, imu_s: FloatArray, yaw_rad: FloatArray, max_delay_s: float = 1.5
+    motions: PingMotions, imu_s: FloatArray, yaw_rad: FloatArray, max_delay_s: float = 2.3
 ) -> list[TurnFit]:
     """How a yaw (K,), not wrapped, turns with the echoes, by sign and delay; the best fit first.
 
