@@ -6,6 +6,7 @@ import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -180,3 +181,35 @@ def test_truth_is_read_from_a_folder_or_a_file(tmp_path: Path) -> None:
         read_truth(tmp_path.parent)
     with pytest.raises(DataError, match="does not exist"):
         read_truth(tmp_path / "nothing")
+
+
+def test_the_report_shows_what_each_vehicle_knew_when(tmp_path: Path) -> None:
+    def told(other: str) -> dict[str, Any]:
+        return {
+            "num_submaps_known": 4,
+            "num_submaps_known_s": [[5.0, 1], [20.0, 3], [31.5, 4]],
+            "joined_s": {other: 40.0},
+            "num_vehicles_merged": 2,
+            "rmse_m": 0.125,
+            "sent": {"coarse": {"packets": 17, "bytes": 1019}},
+            "repeated_packets": 3,
+        }
+
+    link = {
+        "preset": "nano",
+        "loss": 0.3,
+        "last_ping_s": 30.0,
+        "complete_after_last_ping_s": None,
+        "is_same_map": True,
+        "packets": {"sent": 34, "delivered": 23, "lost": 11},
+        "vehicles": {"auv_1": told("auv_2"), "auv_2": told("auv_1")},
+    }
+    facts = RunFacts("title", [], "demo", {}, {}, {}, link=link)
+    write_report(tmp_path, missions.outcome(), facts, missions.truth())
+    html = (tmp_path / "report.html").read_text()
+    assert "Acoustic link" in html
+    assert "coarse 1,019" in html
+    assert "byte for byte" in html
+    assert json.loads((tmp_path / "report.json").read_text())["link"] == link
+    assert cv2.imread(str(tmp_path / "link.png")) is not None
+    _Balance().check(html)

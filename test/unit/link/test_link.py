@@ -170,6 +170,20 @@ def test_detail_comes_where_it_is_asked_for():
     assert same_everywhere(talk)
 
 
+def test_what_is_here_already_is_not_asked_for():
+    talk = fleet(num=2)
+    key = LayerKey.of(77, 1, Layer.FINE)
+    talk.until_all_know(4, 200.0)
+    talk.links[2].ask(1, key)
+    assert talk.links[2].num_asked == 1
+    talk.run(talk.now_s + 60.0)
+    talk.links[2].ask(1, key)
+    assert talk.links[2].num_asked == 0
+    before = len(talk.packets)
+    talk.run(talk.now_s + 600.0)
+    assert len(talk.packets) - before <= 2 * 11  # a sign of life each minute
+
+
 def test_a_restarted_link_has_lost_nothing_and_sends_nothing_again():
     talk = fleet()
     talk.run(6.0)  # some have come

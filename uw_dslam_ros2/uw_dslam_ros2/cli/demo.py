@@ -21,6 +21,13 @@ from uw_dslam_ros2.cli.common import (
     run_command,
     versions,
 )
+from uw_dslam_ros2.cli.demo_link import (
+    DEFAULT_LINK_RATE,
+    LINK_PRESETS,
+    LinkedMission,
+    run_linked,
+)
+from uw_dslam_ros2.cli.link_report import add_maps
 from uw_dslam_ros2.cli.mapping import OfflineConfig
 from uw_dslam_ros2.cli.outcome import outcome_of
 from uw_dslam_ros2.cli.processes import Child, Children, free_domain
@@ -98,6 +105,14 @@ def _parser() -> argparse.ArgumentParser:
         "--dataset", choices=("aracati2017",), help="a real recording, not a simulated one"
     )
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the dataset")
+    parser.add_argument(
+        "--link",
+        choices=LINK_PRESETS,
+        help="each vehicle has a manager of its own, and nothing but acoustic modems joins them",
+    )
+    parser.add_argument(
+        "--loss", type=float, default=0.0, metavar="SHARE", help="of packets on the link"
+    )
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings of the nodes (YAML)")
     return parser
 
@@ -143,14 +158,23 @@ class _Recordings:
 def _run(args: argparse.Namespace) -> int:
     if args.dataset and not args.data:
         raise DataError(f"--dataset {args.dataset} needs --data, the folder of its files")
+    if not 0.0 <= args.loss < 1.0:
+        raise DataError(f"--loss is {args.loss:g}, expected 0 to less than 1")
     SettingsFile(args.config)  # a wrong file is told before anything is simulated
     out = _prepared(args.out)
     steps = _Steps()
     started_s = time.monotonic()
     recordings = _convert(args, out, steps) if args.dataset else _simulate(args, out, steps)
-    notes = _replay(args, out, recordings, steps)
+    link: dict[str, Any] = {}
+    linked = _linked(args, recordings) if args.link else None
+    if linked is not None:
+        notes, link = run_linked(out, linked, steps.begin)
+    else:
+        notes = _replay(args, out, recordings, steps)
     steps.begin("writing the report", "writing maps, pictures and report")
     outcome = outcome_of(load_session(out / SESSION_FOLDER, _queue_config(recordings)))
+    if linked is not None:
+        add_maps(link, linked, out, _queue_config(recordings), recordings.truth)
     steps.end()
     facts = RunFacts(
         title=recordings.title,
@@ -161,10 +185,23 @@ def _run(args: argparse.Namespace) -> int:
         versions=versions(),
         times_s=steps.times_s | {"all": time.monotonic() - started_s},
         notes=notes,
+        link=link,
     )
     scores = write_report(out, outcome, facts, recordings.truth)
     _conclude(out, headline(outcome, scores), scores, time.monotonic() - started_s)
     return 0
+
+
+def _linked(args: argparse.Namespace, recordings: _Recordings) -> LinkedMission:
+    return LinkedMission(
+        recordings.vehicles,
+        recordings.bags,
+        recordings.ping_topic,
+        recordings.config,
+        args.link,
+        args.loss,
+        args.rate or DEFAULT_LINK_RATE,
+    )
 
 
 def _conclude(out: Path, text: str, scores: Scores, seconds: float) -> None:

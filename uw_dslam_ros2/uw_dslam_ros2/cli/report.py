@@ -12,6 +12,7 @@ from typing import Any
 import jinja2
 
 from uw_dslam_ros2.cli import pictures
+from uw_dslam_ros2.cli.link_report import known_over_time
 from uw_dslam_ros2.cli.outcome import Outcome, json_bytes, write_outcome
 from uw_dslam_ros2.cli.scoring import Scores, Truth, score
 from uw_dslam_ros2.cli.wall_lines import walls_of, walls_picture
@@ -47,6 +48,7 @@ class RunFacts:
     times_s: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     findings: list[dict[str, Any]] = field(default_factory=list)
+    link: dict[str, Any] = field(default_factory=dict)
 
 
 def write_report(
@@ -77,7 +79,7 @@ def write_report(
         }
     )
     if has_pictures:
-        images = _draw(outcome, truth, scores)
+        images = _draw(outcome, facts, truth, scores)
         if outcome.global_map is not None:
             figure = walls_picture(outcome.global_map, walls, piers)
             images["walls"] = pictures.png_bytes(figure)
@@ -122,6 +124,8 @@ def report_dict(outcome: Outcome, facts: RunFacts, scores: Scores) -> dict[str, 
     }
     if facts.times_s:
         result["times_s"] = facts.times_s
+    if facts.link:
+        result["link"] = facts.link
     return result
 
 
@@ -157,7 +161,9 @@ def whose_error(scored: Sequence[str], num_vehicles: int) -> str:
     return f"of {', '.join(scored)} alone ({len(scored)} of {num_vehicles} vehicles)"
 
 
-def _draw(outcome: Outcome, truth: Truth | None, scores: Scores) -> dict[str, bytes]:
+def _draw(
+    outcome: Outcome, facts: RunFacts, truth: Truth | None, scores: Scores
+) -> dict[str, bytes]:
     num = len(outcome.vehicles)
     number = {1: "One map", 2: "Two maps", 3: "Three maps", 4: "Four maps"}.get(num, f"{num} maps")
     figures = {"before_after": pictures.before_after(outcome, f"{number} before, one map after")}
@@ -166,6 +172,8 @@ def _draw(outcome: Outcome, truth: Truth | None, scores: Scores) -> dict[str, by
         errors = pictures.error_plot(outcome, truth, scores)
         figures |= {} if comparison is None else {"map_against_truth": comparison}
         figures |= {} if errors is None else {"trajectory_error": errors}
+    if facts.link:
+        figures["link"] = known_over_time(facts.link)
     return {name: pictures.png_bytes(figure) for name, figure in figures.items()}
 
 

@@ -122,8 +122,10 @@ class AcousticLink:
         if sender == self._config.number:
             self._offer(key)
             return self._improved(sender)
-        self._asks[sender, key] = None
-        self._is_curious = True
+        held = self._held.get((sender, key.run, key.sequence))
+        if held is None or held.cells is None or held.cells.layer < key.layer:
+            self._asks[sender, key] = None
+            self._is_curious = True
         return []
 
     def add_answer(self, answer: bytes) -> None:

@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -15,7 +16,7 @@ from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.srv import SaveMap, SaveSession
 
 from uw_dslam_ros2.core.errors import DataError
-from uw_dslam_ros2.ros.plumbing.qos import LATCHED
+from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED
 
 __all__ = ["MissionControl"]
 
@@ -37,11 +38,18 @@ class MissionControl:
         self._check = check
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain_id)
-        self._node = rclpy.create_node("mission_control", context=self._context)
+        # Without a log topic: there may be one of these for each of several domains.
+        self._node = rclpy.create_node(
+            "mission_control", context=self._context, enable_rosout=False
+        )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.status: MergeStatus | None = None
         self._node.create_subscription(MergeStatus, "/merge_status", self._on_status, LATCHED)
+        self._diagnostics: dict[str, dict[str, str]] = {}
+        self._node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._on_diagnostics, DEFAULT
+        )
         self._changed_s = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -62,6 +70,15 @@ class MissionControl:
         if last is None or msg.num_in_flight or _progress_of(msg) != _progress_of(last):
             self._changed_s = time.monotonic()
         self.status = msg
+
+    def _on_diagnostics(self, msg: DiagnosticArray) -> None:
+        for status in msg.status:
+            values = {value.key: value.value for value in status.values}
+            self._diagnostics[status.name.split(": ")[-1]] = values
+
+    def diagnostics_of(self, node: str) -> dict[str, str]:
+        """What a node of that name told last; empty where it told nothing."""
+        return dict(self._diagnostics.get(node, {}))
 
     def spin(self) -> None:
         """Take what has come in, for a tenth of a second at most."""
