@@ -7,6 +7,7 @@ The matcher knows the truth, so that only the merging is timed; every case check
 from __future__ import annotations
 
 import math
+import resource
 import sys
 import tracemalloc
 
@@ -17,7 +18,8 @@ from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.sim.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
 
-_MAX_RMSE_M = 0.5  # one cell
+_MAX_RMSE_M = 0.5  # one cell, for a hundred submaps
+_NUM_LATE = 10
 
 
 def batch(quick: bool) -> None:
@@ -76,6 +78,46 @@ def incremental(quick: bool) -> None:
     )
 
 
+def fleets(quick: bool) -> None:
+    """20 vehicles x 20 submaps and 50 x 50: all at once, then the last few one by one."""
+    numbers, seconds, late = [], [], []
+    for size in (4, 8) if quick else (20, 50):
+        fleet, queue = lawnmower_fleet(size, size, 0), MapQueue()
+        last = [i for i in sorted(fleet.submaps) if i.sequence == size - 1][:_NUM_LATE]
+        settling, adding, asking = Timing(), Timing(), Timing()
+        for submap_id in sorted(fleet.submaps.keys() - set(last)):
+            queue.add_submap(fleet.submaps[submap_id])
+        matcher = KnowingMatcher(fleet)
+        num_searches = timed(lambda q=queue, m=matcher: answer_all(q, m), settling)
+        queue.global_map()
+        queue.is_growing = True
+        queue.submaps()
+        for submap_id in last:
+            timed(lambda f=fleet, q=queue, i=submap_id: _add_and_draw(q, f, i), adding)
+            num_searches += timed(lambda q=queue, m=matcher: answer_all(q, m), asking)
+        queue.is_growing = False
+        num_searches += timed(lambda q=queue, m=matcher: answer_all(q, m), settling)
+        num_components = len({r.component for r in queue.submaps()})
+        require(num_components == 1, f"{num_components} components instead of one")
+        numbers.append(len(fleet.submaps))
+        seconds.append(sum(settling.cpu_s))
+        late.append(float(np.median(adding.cpu_s)))
+        emit(
+            "fleets",
+            {
+                "num_submaps": numbers[-1],
+                "num_searches": num_searches,
+                "rmse_m": fleet.position_rmse_m(queue),
+                "settle_cpu_s": seconds[-1],
+                **adding.row("add_plan_draw_"),
+                **asking.row("ask_"),
+                "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+            },
+        )
+    slopes = _slope(numbers, seconds), _slope(numbers, late)
+    emit("fleets exponents", {"settle_exponent": slopes[0], "add_exponent": slopes[1]})
+
+
 def memory(quick: bool) -> None:
     """Bytes that a settled queue holds, beside those of the submaps' grids."""
     size = 3 if quick else 10
@@ -117,5 +159,5 @@ def _slope(numbers: list[int], values: list[float]) -> float:
 
 
 if __name__ == "__main__":
-    cases = {"batch": batch, "incremental": incremental, "memory": memory}
+    cases = {"batch": batch, "incremental": incremental, "fleets": fleets, "memory": memory}
     sys.exit(run_cases(__doc__ or "", cases))

@@ -5,15 +5,14 @@ Covariances are (3, 3) of x [m], y [m], yaw [rad], each in the frame that its mo
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import SuperLU, splu
-from scipy.special import chdtri
 
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
@@ -68,9 +67,11 @@ class Solution[KeyT: Hashable]:
     is_inlier: NDArray[np.bool_]
 
 
+@functools.cache
 def chi2_threshold(probability: float) -> float:
     """Squared Mahalanobis distance that a share of true motions stays below."""
-    return float(chdtri(3, 1.0 - probability))  # scipy.stats has it too, but loads slowly
+    # scipy.stats has it too, but loads slowly.
+    return float(scipy.special.chdtri(3, 1.0 - probability))
 
 
 def chained_covariance(
@@ -245,7 +246,7 @@ class _System[KeyT: Hashable]:
 
     def normal_equations(
         self, poses: FloatArray, weight: FloatArray
-    ) -> tuple[csc_array, FloatArray]:
+    ) -> tuple[scipy.sparse.csc_array, FloatArray]:
         """Hessian (F, F) over the coordinates that are free, and gradient (F,)."""
         errors, by_target, by_source = _linearized(poses, self._ends, self._measured)
         jacobian = np.concatenate([by_target, by_source], axis=2)
@@ -253,7 +254,7 @@ class _System[KeyT: Hashable]:
         blocks = np.swapaxes(jacobian, 1, 2) @ weighted
         values = np.bincount(self._slots, blocks.ravel())[self._is_free]
         size = len(self._starts) - 1
-        hessian = csc_array(
+        hessian = scipy.sparse.csc_array(
             (values, self._row[self._is_free].astype(np.int32), self._starts.astype(np.int32)),
             (size, size),
         )
@@ -310,9 +311,9 @@ def _linearized(
     return errors, by_target, by_source
 
 
-def _factorized(hessian: csc_array) -> SuperLU:
+def _factorized(hessian: scipy.sparse.csc_array) -> scipy.sparse.linalg.SuperLU:
     """Sparse factors of a symmetric, positive matrix."""
-    return splu(
+    return scipy.sparse.linalg.splu(
         hessian,
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,

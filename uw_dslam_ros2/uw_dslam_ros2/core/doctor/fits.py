@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from uw_dslam_ros2.core.doctor.ping_motion import PingMotions
 from uw_dslam_ros2.core.doctor.sample import NavigationSample
@@ -232,4 +232,4 @@ def confidence_of(better: FloatArray, worse: FloatArray) -> float:
     """
     both = np.isfinite(better) & np.isfinite(worse)
     lead = float((worse[both] - better[both]).sum()) / 2.0
-    return float(expit(lead))
+    return float(scipy.special.expit(lead))

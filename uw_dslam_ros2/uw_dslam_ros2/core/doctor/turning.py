@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from uw_dslam_ros2.core.doctor.fits import at_times
 from uw_dslam_ros2.core.doctor.sample import NavigationSample
@@ -181,7 +181,9 @@ def _held(grid: FloatArray, known_s: FloatArray, known: FloatArray) -> FloatArra
     if len(known_s) == 0:
         return np.full(len(grid), np.nan)
     # A velocity that is wrong by metres is wrong for one message.
-    return np.asarray(np.interp(grid, known_s, median_filter(known, 3, mode="nearest")))
+    return np.asarray(
+        np.interp(grid, known_s, scipy.ndimage.median_filter(known, 3, mode="nearest"))
+    )
 
 
 class TurningTrial:

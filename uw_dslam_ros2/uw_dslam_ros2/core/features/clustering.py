@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 
@@ -20,7 +20,7 @@ def mean_spacing(points: ArrayLike) -> float:
     array = _checked(points)
     if len(array) < 2:
         return 0.0
-    distances, _ = cKDTree(array).query(array, k=2)
+    distances, _ = scipy.spatial.cKDTree(array).query(array, k=2)
     return float(distances[:, 1].mean())
 
 
@@ -49,11 +49,11 @@ def cluster_filter(
         return np.zeros(0, dtype=np.bool_)
     radius_m = max(radius_factor * mean_spacing(array), 1e-12)
     # Which cluster a point is in does not matter here, so the clusters need not be grown.
-    counts = cKDTree(array).query_ball_point(array, radius_m, return_length=True)
+    counts = scipy.spatial.cKDTree(array).query_ball_point(array, radius_m, return_length=True)
     is_core = np.asarray(counts) >= min_cluster_size
     if not is_core.any():
         return is_core
-    distances, _ = cKDTree(array[is_core]).query(array)
+    distances, _ = scipy.spatial.cKDTree(array[is_core]).query(array)
     return np.asarray(distances <= radius_m)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.features.clustering import mean_spacing
@@ -51,7 +51,7 @@ def sample_voxels(
     cells = np.floor((array - array.min(axis=0)) / size)
     centers = np.unique((cells + 0.5) * size, axis=0)
     # In the largest norm, the nearest centre is that of the voxel around the point.
-    _, voxels = cKDTree(centers).query(array - array.min(axis=0), p=np.inf)
+    _, voxels = scipy.spatial.cKDTree(centers).query(array - array.min(axis=0), p=np.inf)
     order = np.random.default_rng(seed).permutation(len(array))
     _, first = np.unique(voxels[order], return_index=True)
     return np.sort(order[first])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from uw_dslam_ros2.core.mapping.config import WIDE_BEAM_RAD, MatchConfig
 from uw_dslam_ros2.core.mapping.matcher import (
@@ -83,7 +83,7 @@ class LocalMap:
         known = np.vstack([p for p, _, _ in self._pings])
         if len(known) < _MIN_POINTS:
             return False
-        distance_m, _ = cKDTree(known).query(points, distance_upper_bound=_NEAR_M)
+        distance_m, _ = scipy.spatial.cKDTree(known).query(points, distance_upper_bound=_NEAR_M)
         return bool(np.isfinite(distance_m).mean() > 0.5)
 
     def match(self, points: FloatArray, weight: FloatArray, prior: Prior) -> ScanMatch | None:

@@ -13,8 +13,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import InvalidInputError
@@ -225,7 +225,7 @@ def _lost_walls(before: CellArray, after: CellArray) -> tuple[int, int]:
     One cell to the side is the same: the lattice moves, and walls are redrawn.
     """
     walls = before > _WALL_PERCENT
-    near = binary_dilation(after > _WALL_PERCENT, structure=np.ones((3, 3)))
+    near = scipy.ndimage.binary_dilation(after > _WALL_PERCENT, structure=np.ones((3, 3)))
     return int(np.count_nonzero(walls)), int(np.count_nonzero(walls & ~near))
 
 

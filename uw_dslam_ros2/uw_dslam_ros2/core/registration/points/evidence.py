@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from uw_dslam_ros2.core.registration.points.refinement import Refinement
 from uw_dslam_ros2.core.se2 import SE2
@@ -35,8 +35,8 @@ class Outline:
         Points on a line get a box around it, as wide as their distance.
         """
         try:
-            hull = ConvexHull(points)
-        except (QhullError, ValueError):  # fewer than three points, or all on a line
+            hull = scipy.spatial.ConvexHull(points)
+        except (scipy.spatial.QhullError, ValueError):  # fewer than three points, or all on a line
             return cls._box(points)
         count, corners = len(points), points[hull.vertices]
         middle = corners.mean(axis=0)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 __all__ = ["nnde_density", "nnde_inliers"]
 
@@ -21,7 +21,7 @@ def nnde_density(
     perfect pair would push all others to zero. Then the minimum becomes 0 and the maximum 1.
     """
     count = min(num_neighbors, len(others))
-    distances, _ = cKDTree(others).query(points, k=count)
+    distances, _ = scipy.spatial.cKDTree(others).query(points, k=count)
     mean = np.asarray(distances, dtype=np.float64).reshape(len(points), count).mean(axis=1)
     density = 1.0 / (mean + scale_m)
     spread = density.max() - density.min()

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from uw_dslam_ros2.core.registration.config import RegistrationConfig
 from uw_dslam_ros2.core.registration.points.evidence import EvidenceModel
@@ -168,7 +168,7 @@ def _has_partner(
 ) -> NDArray[np.bool_]:
     """Source points with a target within three standard deviations of a pair."""
     reach = max(3.0 * best.sigma_m, 1e-3 * spacing_m)
-    distances, _ = cKDTree(target).query(moved)
+    distances, _ = scipy.spatial.cKDTree(target).query(moved)
     return np.asarray(distances <= reach)
 
 

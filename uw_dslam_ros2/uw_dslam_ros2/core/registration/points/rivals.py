@@ -11,9 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.special import log_ndtr
 
 from uw_dslam_ros2.core.registration.points.refinement import Refinement
 
@@ -33,7 +32,7 @@ def log_contributions(
     other points are paired with; `area_m2` is what clutter is spread over.
     """
     m, n = len(source), len(target)
-    distances, _ = cKDTree(target).query(
+    distances, _ = scipy.spatial.cKDTree(target).query(
         refinement.pose().apply(source), k=list(range(1, min(_NEIGHBORS, n) + 1))
     )
     pairs, variance = refinement.num_pairs, refinement.sigma_m**2
@@ -52,4 +51,6 @@ def log_odds(best: FloatArray, rival: FloatArray, repetition: float) -> float:
     total = max(float(ratio.sum()), 0.0)
     if scatter <= 1e-12 * total:
         return -math.inf if total > 0.0 else 0.0
-    return float(log_ndtr(-total / scatter) - log_ndtr(total / scatter))
+    return float(
+        scipy.special.log_ndtr(-total / scatter) - scipy.special.log_ndtr(total / scatter)
+    )
