@@ -484,6 +484,25 @@ def test_what_is_missing_and_cannot_be_had_is_told(manage, monkeypatch):
     assert {v.key: v.value for v in statuses[-1].values}["num_submaps_missing"] == "4"
 
 
+def test_what_is_set_aside_is_told(manage):
+    statuses = []
+
+    def on_diagnostics(msg):
+        statuses.extend(s for s in msg.status if s.name.startswith("map_queue_manager"))
+
+    far = SE2(5000.0, 0.0)
+    with manage(**FAST) as (until, probe, _):
+        probe.node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
+        probe.send(room_submap("auv_1"))
+        probe.send(room_submap("auv_1", sequence=1, T_odom_submap=far))
+        until(lambda: SubmapInfo.SET_ASIDE in probe.states().values(), "the leap")
+        until(lambda: statuses and "auv_1: set aside: odometry" in statuses[-1].message, "a word")
+        assert statuses[-1].level == DiagnosticStatus.WARN
+        probe.send(room_submap("auv_1", sequence=1, revision=1))
+        until(lambda: SubmapInfo.SET_ASIDE not in probe.states().values(), "its return")
+        until(lambda: "set aside" not in statuses[-1].message, "no more word of it")
+
+
 def test_two_managers_do_not_share_a_session(manage, ros_context, tmp_path):
     settings = {"session": str(tmp_path / "session"), **FAST}
     with manage(has_server=False, **settings) as (until, probe, _):

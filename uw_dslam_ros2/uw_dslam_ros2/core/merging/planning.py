@@ -10,6 +10,7 @@ from uw_dslam_ros2.core.merging.asking.growing import make_growing_plan
 from uw_dslam_ros2.core.merging.asking.pairwise import make_pairwise_plan
 from uw_dslam_ros2.core.merging.asking.plan import Plan, make_plan
 from uw_dslam_ros2.core.merging.by_hand import matches_by_hand
+from uw_dslam_ros2.core.merging.checks.contradictions import contradicting_map
 from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track, implausible_submaps
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.decisions import DecisionLog
@@ -21,8 +22,6 @@ from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["Planning"]
 
-_CONTRADICTS = "set aside with its whole run, which contradicts the others' maps"
-
 
 class Planning:
     """Makes plans, and remembers what it has worked out and whom it has set aside."""
@@ -32,6 +31,7 @@ class Planning:
         self._memory = Memory()
         self._implausible: dict[SubmapId, str] = {}
         self._contradicting: list[Track] = []
+        self._why: dict[Track, str] = {}
         self.aside: dict[SubmapId, str] = {}
         """What the last plan leaves out, and why."""
 
@@ -77,12 +77,13 @@ class Planning:
             self._contradicting = []
             whole, sound = plan, library
             while len(self._contradicting) < len(tracks) and not plan.wanted:
-                track = contradicting_track(sound, plan.constraints, min(sound.submaps))
+                track, why = self._unsound(sound, plan)
                 if track is None or any(
                     track in (end.track for end in decision.pair) for decision in library.confirmed
                 ):
                     break  # a person wants it in the map
                 self._contradicting.append(track)
+                self._why[track] = why
                 sound = library.without(self._contradicting)
                 plan = plan_with(sound)
             plan = dataclasses.replace(plan, wanted=[*whole.wanted, *plan.wanted])
@@ -94,9 +95,24 @@ class Planning:
             wanted += [query for query in plan.wanted if query.key not in known]
             plan = dataclasses.replace(plan, wanted=wanted)
         self.aside = self._implausible | {
-            i: _CONTRADICTS for i in library.submaps if i.track in self._contradicting
+            i: f"set aside with its whole run, {self._why[i.track]}"
+            for i in library.submaps
+            if i.track in self._contradicting
         }
         return plan
+
+    def _unsound(self, library: Library, plan: Plan) -> tuple[Track | None, str]:
+        """The run that contradicts the others, by its matches or by its map, and how."""
+        track = contradicting_track(library, plan.constraints, min(library.submaps))
+        if track is not None:
+            return track, "which contradicts the others' maps: most of its matches do not hold"
+        found = contradicting_map(library.active, plan.components, self._memory)
+        if found is None:
+            return None, ""
+        return found.track, (
+            f"which contradicts the others' maps: {found.num} of its {found.num_judged} submaps "
+            "that others have seen too have their walls in free water"
+        )
 
     def _plan_with(
         self,

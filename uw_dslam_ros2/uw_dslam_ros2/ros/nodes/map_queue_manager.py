@@ -344,6 +344,8 @@ class MapQueueManager(ManagedNode):
             return "warning", "no registration server on the graph", values
         if lost := self._missing.lost:
             return "warning", lost, values
+        if aside := self._status.aside:
+            return "warning", aside, values
         return "info", self._message, values
 
 

@@ -19,6 +19,7 @@ from uw_dslam_ros2.core.merging import (
     SubmapState,
 )
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Track, track_name
 from uw_dslam_ros2.ros.convert.merging import (
     constraint_to_msg,
     graph_to_markers,
@@ -32,6 +33,7 @@ from uw_dslam_ros2.ros.plumbing.qos import LATCHED
 __all__ = ["QueueFrames", "StatusPublisher"]
 
 Values = dict[str, float | int | str]
+_COUNTS = ("num_waiting", "num_merged", "num_set_aside", "num_components", "num_registrations")
 
 
 class StatusPublisher:
@@ -43,6 +45,7 @@ class StatusPublisher:
         self._graph_pub = node.create_publisher(MarkerArray, "pose_graph", LATCHED)
         self.values: Values = {}
         """Of the last status, for the diagnostics."""
+        self._aside: dict[Track, str] = {}
 
     def publish(self, queue: MapQueue, num_in_flight: int, num_servers: int, message: str) -> None:
         """Tell how it stands."""
@@ -67,14 +70,30 @@ class StatusPublisher:
         self._status_pub.publish(msg)
         markers = graph_to_markers(records, constraints, self._map_frame, stamp)
         self._graph_pub.publish(markers)
-        self.values = {
-            name: getattr(msg, name)
-            for name in ("num_waiting", "num_merged", "num_components", "num_registrations")
-        }
+        self._tell_aside(records)
+        self.values = {name: getattr(msg, name) for name in _COUNTS}
         self.values |= {"num_in_flight": num_in_flight, "num_servers": num_servers}
         self.values["num_submaps"] = len(records)
         self.values["is_growing"] = int(queue.is_growing)
         self.values |= _residuals(queue, constraints)
+
+    @property
+    def aside(self) -> str:
+        """Who is set aside, and why; empty: nobody is."""
+        return "; ".join(f"{track_name(track)}: {why}" for track, why in self._aside.items())
+
+    def _tell_aside(self, records: Sequence[SubmapRecord]) -> None:
+        """Say so when a run, or a part of it, is set aside, and when it is back."""
+        aside: dict[Track, str] = {}
+        for record in records:
+            if record.state is SubmapState.SET_ASIDE:
+                aside.setdefault(record.submap.submap_id.track, record.reason)
+        logger = self._node.get_logger()
+        for track in aside.keys() - self._aside.keys():
+            logger.warning(f"{track_name(track)}: {aside[track]}")
+        for track in self._aside.keys() - aside.keys():
+            logger.info(f"{track_name(track)} is not set aside any more")
+        self._aside = aside
 
 
 def _residuals(queue: MapQueue, constraints: Sequence[Constraint]) -> Values:
