@@ -60,6 +60,8 @@ SERVICES = {
     "/map_queue_manager/list_registrations": "uw_dslam_msgs/srv/ListRegistrations",
     "/map_queue_manager/get_submap": "uw_dslam_msgs/srv/GetSubmap",
     "/map_queue_manager/withdraw_submap": "uw_dslam_msgs/srv/WithdrawSubmap",
+    "/map_queue_manager/decide": "uw_dslam_msgs/srv/Decide",
+    "/map_queue_manager/list_decisions": "uw_dslam_msgs/srv/ListDecisions",
     "/map_queue_manager/restore_submap": "uw_dslam_msgs/srv/RestoreSubmap",
     "/map_queue_manager/save_session": "uw_dslam_msgs/srv/SaveSession",
     "/map_queue_manager/load_session": "uw_dslam_msgs/srv/LoadSession",

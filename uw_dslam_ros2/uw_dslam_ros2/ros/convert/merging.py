@@ -1,15 +1,11 @@
-"""State of the map queue as messages: status, and markers of the pose graph for RViz."""
+"""State of the map queue as messages."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from builtin_interfaces.msg import Duration as DurationMsg
-from builtin_interfaces.msg import Time as TimeMsg
-from geometry_msgs.msg import Point
-from std_msgs.msg import ColorRGBA
 from uw_dslam_msgs.msg import (
     AnsweredRegistration,
     MergeGroup,
@@ -18,7 +14,6 @@ from uw_dslam_msgs.msg import (
     SubmapPose,
 )
 from uw_dslam_msgs.msg import Constraint as ConstraintMsg
-from visualization_msgs.msg import Marker, MarkerArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
@@ -44,28 +39,11 @@ __all__ = [
     "answer_to_msg",
     "constraint_from_msg",
     "constraint_to_msg",
-    "graph_to_markers",
     "group_frame_ids",
     "groups_to_msgs",
     "record_from_msg",
     "record_to_msg",
 ]
-
-_NODE_SIZE_M = 0.8
-_LINE_WIDTH_M = 0.15
-_TEXT_HEIGHT_M = 1.2
-_ODOMETRY_COLOR = (0.6, 0.6, 0.6, 1.0)
-_INLIER_COLOR = (0.1, 0.7, 0.2, 1.0)
-_UNSURE_COLOR = (0.95, 0.75, 0.1, 1.0)
-_OUTLIER_COLOR = (0.9, 0.1, 0.1, 0.6)
-_VEHICLE_COLORS = (
-    (0.12, 0.47, 0.71, 1.0),
-    (1.00, 0.50, 0.05, 1.0),
-    (0.58, 0.40, 0.74, 1.0),
-    (0.09, 0.75, 0.81, 1.0),
-    (0.89, 0.47, 0.76, 1.0),
-    (0.74, 0.74, 0.13, 1.0),
-)
 
 
 def record_to_msg(record: SubmapRecord) -> SubmapInfo:
@@ -268,88 +246,3 @@ def constraint_to_msg(constraint: Constraint) -> ConstraintMsg:
         is_inlier=bool(constraint.is_inlier),
         is_unsure=bool(constraint.is_unsure),
     )
-
-
-def graph_to_markers(
-    records: Iterable[SubmapRecord],
-    constraints: Iterable[Constraint],
-    frame_id: str,
-    stamp: TimeMsg,
-) -> MarkerArray:
-    """Merged submaps as spheres in their vehicle's colour, edges as lines.
-
-    Odometry is grey, registrations are green, yellow where the answer was unsure alone, red where
-    rejected.
-    """
-    merged = {
-        record.submap.submap_id: record.T_component_submap
-        for record in records
-        if record.component == 0 and record.state == SubmapState.MERGED
-    }
-    markers = [_marker(frame_id, stamp, "clear", 0, Marker.DELETEALL)]
-    vehicles = sorted({submap_id.vehicle_id for submap_id in merged})
-    for index, vehicle_id in enumerate(vehicles):
-        color = _VEHICLE_COLORS[index % len(_VEHICLE_COLORS)]
-        nodes = _marker(frame_id, stamp, "submaps", index, Marker.ADD, Marker.SPHERE_LIST)
-        nodes.scale.x = nodes.scale.y = nodes.scale.z = _NODE_SIZE_M
-        nodes.color = _color(color)
-        nodes.points = [_point(T) for i, T in merged.items() if i.vehicle_id == vehicle_id]
-        label = _marker(frame_id, stamp, "names", index, Marker.ADD, Marker.TEXT_VIEW_FACING)
-        first = min(submap_id for submap_id in merged if submap_id.vehicle_id == vehicle_id)
-        label.pose.position.x = merged[first].x
-        label.pose.position.y = merged[first].y
-        label.pose.position.z = _TEXT_HEIGHT_M
-        label.scale.z = _TEXT_HEIGHT_M
-        label.color = _color(color)
-        label.text = vehicle_id
-        markers += [nodes, label]
-    markers += _edge_markers(constraints, merged, frame_id, stamp)
-    return MarkerArray(markers=markers)
-
-
-def _edge_markers(
-    constraints: Iterable[Constraint],
-    merged: Mapping[SubmapId, SE2],
-    frame_id: str,
-    stamp: TimeMsg,
-) -> list[Marker]:
-    lines: dict[str, tuple[tuple[float, float, float, float], list[Point]]] = {
-        "odometry": (_ODOMETRY_COLOR, []),
-        "registrations": (_INLIER_COLOR, []),
-        "unsure": (_UNSURE_COLOR, []),
-        "rejected": (_OUTLIER_COLOR, []),
-    }
-    for constraint in constraints:
-        if constraint.source not in merged or constraint.target not in merged:
-            continue
-        name = "odometry" if constraint.kind == ConstraintKind.ODOMETRY else "registrations"
-        if constraint.is_unsure:
-            name = "unsure"
-        points = lines[name if constraint.is_inlier else "rejected"][1]
-        points += [_point(merged[constraint.source]), _point(merged[constraint.target])]
-    markers = []
-    for index, (name, (color, points)) in enumerate(lines.items()):
-        if points:
-            marker = _marker(frame_id, stamp, name, index, Marker.ADD, Marker.LINE_LIST)
-            marker.scale.x = _LINE_WIDTH_M
-            marker.color = _color(color)
-            marker.points = points
-            markers.append(marker)
-    return markers
-
-
-def _marker(
-    frame_id: str, stamp: TimeMsg, namespace: str, number: int, action: int, kind: int = 0
-) -> Marker:
-    marker = Marker(ns=namespace, id=number, action=action, type=kind, lifetime=DurationMsg())
-    marker.header.frame_id = frame_id
-    marker.header.stamp = stamp
-    return marker
-
-
-def _color(rgba: tuple[float, float, float, float]) -> ColorRGBA:
-    return ColorRGBA(r=rgba[0], g=rgba[1], b=rgba[2], a=rgba[3])
-
-
-def _point(T_map_submap: SE2) -> Point:
-    return Point(x=T_map_submap.x, y=T_map_submap.y, z=0.0)

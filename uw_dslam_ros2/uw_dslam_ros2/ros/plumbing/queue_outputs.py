@@ -20,9 +20,9 @@ from uw_dslam_ros2.core.merging import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Track, track_name
+from uw_dslam_ros2.ros.convert.graph_markers import graph_to_markers
 from uw_dslam_ros2.ros.convert.merging import (
     constraint_to_msg,
-    graph_to_markers,
     group_frame_ids,
     groups_to_msgs,
     record_to_msg,
@@ -63,12 +63,14 @@ class StatusPublisher:
             num_registrations=queue.num_registrations,
             num_in_flight=num_in_flight,
             num_servers=num_servers,
+            num_decisions=queue.num_decisions,
             message=message,
         )
         msg.header.stamp = stamp
         msg.header.frame_id = self._map_frame
         self._status_pub.publish(msg)
-        markers = graph_to_markers(records, constraints, self._map_frame, stamp)
+        decided = [record.decision for record in queue.decisions() if record.is_in_force]
+        markers = graph_to_markers(records, constraints, self._map_frame, stamp, decided)
         self._graph_pub.publish(markers)
         self._tell_aside(records)
         self.values = {name: getattr(msg, name) for name in _COUNTS}

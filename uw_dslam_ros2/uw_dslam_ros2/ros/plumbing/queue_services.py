@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,9 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from uw_dslam_msgs.srv import (
+    Decide,
     GetSubmap,
+    ListDecisions,
     ListRegistrations,
     ListSubmaps,
     LoadSession,
@@ -22,13 +25,14 @@ from uw_dslam_msgs.srv import (
 )
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.core.merging import Decision, DecisionKind, MapQueue
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.session import SESSION_FILE, has_session
 from uw_dslam_ros2.io.session_export import export_queue
-from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
+from uw_dslam_ros2.ros.convert.core_types import submap_to_msg, transform2d_to_msg
+from uw_dslam_ros2.ros.convert.decisions import decision_from_msg, decision_to_msg
 from uw_dslam_ros2.ros.convert.merging import answer_to_msg, record_to_msg
 from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 from uw_dslam_ros2.ros.plumbing.worker import Worker
@@ -73,12 +77,14 @@ class QueueServices:
     def __init__(
         self, node: Node, owner: QueueOwner, worker: Worker, group: ReentrantCallbackGroup
     ) -> None:
-        self._owner, self._worker = owner, worker
+        self._node, self._owner, self._worker = node, owner, worker
         for service_type, name, handler in (
             (SaveMap, "save_map", self._save_map),
             (ListSubmaps, "list_submaps", self._list_submaps),
             (GetSubmap, "get_submap", self._get_submap),
             (ListRegistrations, "list_registrations", self._list_registrations),
+            (Decide, "decide", self._decide),
+            (ListDecisions, "list_decisions", self._list_decisions),
             (WithdrawSubmap, "withdraw_submap", self._withdraw_submap),
             (RestoreSubmap, "restore_submap", self._restore_submap),
             (SaveSession, "save_session", self._save_session),
@@ -149,22 +155,50 @@ class QueueServices:
             )
         ]
 
+    def _decide(self, request: Decide.Request, response: Decide.Response) -> None:
+        queue = self._owner.queue
+        asked = decision_from_msg(request.decision, queue.newest_run, queue.stated_pose)
+        ends = [end for end in (asked.source, asked.target) if end is not None]
+        if lacking := next((end for end in ends if queue.submap(end) is None), None):
+            response.result, response.message = response.NOT_FOUND, _not_found(lacking)
+            return
+        if asked.undone > queue.num_decisions:
+            response.result = response.NOT_FOUND
+            response.message = f"no decision {asked.undone}; ~/list_decisions lists them"
+            return
+        # By the caller's clock, else by this node's.
+        stamp_ns = asked.stamp_ns or int(self._node.get_clock().now().nanoseconds)
+        taken = queue.decide(dataclasses.replace(asked, stamp_ns=stamp_ns, number=0))
+        response.result, response.number = response.DONE, taken.number
+        response.message = _sentence(taken)
+        self._owner.changed(response.message)
+
+    def _list_decisions(self, _: Any, response: ListDecisions.Response) -> None:
+        queue = self._owner.queue
+        response.decisions = [
+            decision_to_msg(record.decision, record.is_in_force, record.remark)
+            for record in queue.decisions()
+        ]
+        found = queue.georeference()
+        response.t_earth_map = transform2d_to_msg(None if found is None else found.T_earth_map)
+        if found is not None:
+            response.earth_frame = found.earth_frame
+
     def _submap_id(self, request: Any) -> SubmapId:
         """Which submap is meant; without a run that of the vehicle's newest one."""
         run_id = int(request.run_id) or self._owner.queue.newest_run(request.vehicle_id)
         return SubmapId(request.vehicle_id, run_id, int(request.sequence))
 
     def _withdraw_submap(self, request: Any, response: Any) -> None:
-        self._switch(request, response, self._owner.queue.withdraw, "withdrawn")
+        self._switch(request, response, DecisionKind.WITHDRAW, "withdrawn")
 
     def _restore_submap(self, request: Any, response: Any) -> None:
-        self._switch(request, response, self._owner.queue.restore, "back in the queue")
+        self._switch(request, response, DecisionKind.RESTORE, "back in the queue")
 
-    def _switch(
-        self, request: Any, response: Any, act: Callable[[SubmapId], bool], word: str
-    ) -> None:
-        submap_id = self._submap_id(request)
-        if not act(submap_id):
+    def _switch(self, request: Any, response: Any, kind: DecisionKind, word: str) -> None:
+        submap_id, queue = self._submap_id(request), self._owner.queue
+        act = queue.withdraw if kind is DecisionKind.WITHDRAW else queue.restore
+        if not act(submap_id, stamp_ns=int(self._node.get_clock().now().nanoseconds)):
             response.result, response.message = response.NOT_FOUND, _not_found(submap_id)
             return
         response.result = response.DONE
@@ -195,6 +229,17 @@ class QueueServices:
         self._owner.settle()
         response.success = True
         response.message = "what is left to match is asked now"
+
+
+def _sentence(decision: Decision) -> str:
+    """What was decided, in a line."""
+    who = decision.who or "somebody"
+    if decision.kind is DecisionKind.UNDO:
+        return f"decision {decision.number}: {who} undid decision {decision.undone}"
+    kind = decision.kind.name
+    ends = [str(end) for end in (decision.source, decision.target) if end is not None]
+    whole = " (whole runs)" if decision.is_run else ""
+    return f"decision {decision.number}: {who} said {kind} of {' and '.join(ends)}{whole}"
 
 
 def _not_found(submap_id: SubmapId) -> str:

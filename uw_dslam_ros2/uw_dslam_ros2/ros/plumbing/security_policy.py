@@ -29,7 +29,7 @@ _LIFE_CYCLE = (
 _SENSORS = ("sonar", "scan", "points", "dvl", "imu", "depth")
 _QUEUE_SERVICES = (
     *("save_map", "list_submaps", "get_submap", "list_registrations", "withdraw_submap"),
-    *("restore_submap", "save_session", "load_session", "settle"),
+    *("restore_submap", "decide", "list_decisions", "save_session", "load_session", "settle"),
 )
 
 
