@@ -85,6 +85,7 @@ CASES = {
         imu(lambda _, yaw, rate: (yaw, np.degrees(rate))), {"imu_rates_in_degrees": True},
     ),
     "heading_disturbed": (imu(near_steel), {"imu_orientation": "none"}),
+    "imu_drift": (imu(lambda t, yaw, rate: (yaw + 0.004 * t, rate + 0.004)), {}),
     "dvl_sign": (dvl(lambda _, v: -v), {"velocity_yaw_offset_rad": math.pi}),
     "dvl_turned": (dvl(lambda _, v: turned(v, -0.8)), {"velocity_yaw_offset_rad": 0.8}),
     "dvl_mirrored": (dvl(lambda _, v: v * [1.0, -1.0]), {"velocity_is_mirrored": True}),

@@ -21,6 +21,7 @@ from uw_dslam_ros2.core.doctor.fits import (
     confidence_of,
     fit_turns,
     fit_velocity,
+    turn_bias,
 )
 from uw_dslam_ros2.core.doctor.imu import ImuState, compare_yaw_and_rate
 from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
@@ -37,10 +38,12 @@ _MIN_MOTIONS = 15
 _MIN_READINGS = 20
 _MAX_TURN_COST = 1.5
 _MIN_OFFSET_RAD = math.radians(4.0)
+_MIN_DRIFT_RAD_S = math.radians(0.05)
 _MIN_SCALE_ERROR = 0.019
 _USUAL_SCALE_ERROR = 0.015
 """A DVL and a speed of sound that are as good as data sheets say disagree by less."""
 _UNIT_SCALE = 1.3
+_UNIT_TOLERANCE = 0.025  # tells knots from half
 _UNITS = {
     "millimetres per second": 1e-3, "centimetres per second": 1e-2, "knots": 0.5144,
     "kilometres per hour": 1.0 / 3.6,
@@ -128,6 +131,7 @@ class _Trial:
             return
         self._yaw = by_rates if rates else imu.by_orientation
         self._delay_s = fits[0].delay_s
+        self._judge_drift(fits[0])
         reading: _Reading | None = _Reading(fits[0].sign)
         if rates and orientation and rates[0].sign != orientation[0].sign:
             self._say_one_flipped(rates[0].sign, orientation[0].sign, orientation)
@@ -179,6 +183,19 @@ class _Trial:
     ) -> None:
         finding = Finding(kind, role, detail, confidence, vehicle_id=self._vehicle_id)
         self._result.add(finding, **changes)
+
+    def _judge_drift(self, fit: TurnFit) -> None:
+        assert self._yaw is not None
+        bias, sigma = turn_bias(self._motions, self._navigation.imu_s, self._yaw, fit)
+        if abs(bias) < max(_MIN_DRIFT_RAD_S, 5.0 * sigma):
+            return
+        self._add(
+            "imu_drift",
+            "imu",
+            f"it turns by {60.0 * abs(math.degrees(bias)):.1f} degrees a minute where the sonar's "
+            "echoes do not: its gyro has a bias; let it settle before the dive, or calibrate it",
+            _confidence_in(bias, sigma),
+        )
 
     # --- who turns the other way
     # -------------------------------------------------------------------------------------------
@@ -319,14 +336,20 @@ class _Trial:
             return
         if not 1.0 / _UNIT_SCALE < fit.scale < _UNIT_SCALE:
             name, unit = min(_UNITS.items(), key=lambda item: abs(math.log(fit.scale / item[1])))
-            is_unit = abs(math.log(fit.scale / unit)) < 0.1
+            is_unit = abs(math.log(fit.scale / unit)) < _UNIT_TOLERANCE
             factor = unit if is_unit else fit.scale
             self._add(
                 "dvl_unit",
                 "velocity",
                 f"its velocity is {1.0 / fit.scale:.3g} times that of the sonar's echoes"
                 + (f": it is in {name}" if is_unit else "")
-                + f" (conventions.velocity_scale: {factor:.4g})",
+                + f" (conventions.velocity_scale: {factor:.4g}"
+                + (
+                    ")"
+                    if is_unit
+                    else "; if it is the sonar's ranges that are wrong, "
+                    f"conventions.sonar_range_scale: {1.0 / fit.scale:.4g} instead)"
+                ),
                 velocity_scale=float(f"{factor:.4g}"),
             )
             return

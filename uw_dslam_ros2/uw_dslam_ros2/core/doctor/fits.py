@@ -19,6 +19,7 @@ __all__ = [
     "confidence_of",
     "fit_turns",
     "fit_velocity",
+    "turn_bias",
     "turned",
 ]
 
@@ -122,6 +123,21 @@ def fit_turns(
     fits.sort(key=lambda fit: float(fit.cost.sum()))
     still = _turn_cost(motions, imu_s, yaw_rad, fits[0].sign, 0.0)
     return [*fits, TurnFit(fits[0].sign, 0.0, still)]
+
+
+def turn_bias(
+    motions: PingMotions, imu_s: FloatArray, yaw_rad: FloatArray, fit: TurnFit
+) -> tuple[float, float]:
+    """By how much faster than the echoes a yaw (K,) turns, and its standard deviation [rad/s]."""
+    turns = fit.sign * _turns(motions, imu_s, yaw_rad, fit.delay_s)
+    error = np.mod(turns - motions.motion[:, 2] + math.pi, 2.0 * math.pi) - math.pi
+    rates = (error / (motions.end_s - motions.begin_s))[np.isfinite(error)]
+    if len(rates) < 2:
+        return 0.0, math.inf
+    middle = float(np.median(rates))
+    # That of a median of normal values, by the median deviation.
+    spread = 1.48 * float(np.median(np.abs(rates - middle)))
+    return fit.sign * middle, 1.25 * spread / math.sqrt(len(rates))
 
 
 def fit_velocity(
