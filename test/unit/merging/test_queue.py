@@ -11,7 +11,8 @@ from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue, MapQueueConfig, SubmapState
-from uw_dslam_ros2.core.merging.graph.components import Constraint, loop_errors
+from uw_dslam_ros2.core.merging.graph.components import Constraint
+from uw_dslam_ros2.core.merging.graph.solving import loop_errors
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2

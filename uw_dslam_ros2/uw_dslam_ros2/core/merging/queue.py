@@ -18,7 +18,7 @@ from uw_dslam_ros2.core.merging.frame import GlobalFrame
 from uw_dslam_ros2.core.merging.georeference import Georeference, georeference_of
 from uw_dslam_ros2.core.merging.global_map import GlobalMap, undrawable
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
-from uw_dslam_ros2.core.merging.graph.components import LoopError, loop_errors
+from uw_dslam_ros2.core.merging.graph.components import LoopError
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.planning import Planning
@@ -284,6 +284,9 @@ class MapQueue:
 
     def loops(self) -> list[LoopError]:
         """Cycles of three and more submaps in the graph, and by how much each fails to close."""
+        # networkx is large, and not every node that starts has something to solve.
+        from uw_dslam_ros2.core.merging.graph.solving import loop_errors
+
         plan = self._plan()
         return loop_errors(
             plan.odometry, [constraint for constraint in plan.constraints if constraint.is_inlier]

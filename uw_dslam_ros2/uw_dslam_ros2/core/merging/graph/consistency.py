@@ -10,7 +10,6 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -117,6 +116,8 @@ def consistent_set(
     inlier_probability
         Share of true pairs that the chi-square test lets pass.
     """
+    import networkx as nx  # large, and not every node that starts has something to compare
+
     threshold = chi2_threshold(inlier_probability)
     graph = nx.Graph()
     # A clique finder takes exponential time in the worst case.

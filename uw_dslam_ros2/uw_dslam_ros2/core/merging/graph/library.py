@@ -18,7 +18,7 @@ from uw_dslam_ros2.core.merging.config import (
 )
 from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.graph.answers import Query
-from uw_dslam_ros2.core.merging.graph.components import Component, Constraint, solve_components
+from uw_dslam_ros2.core.merging.graph.components import Component, Constraint
 from uw_dslam_ros2.core.merging.graph.consistency import Side
 from uw_dslam_ros2.core.merging.graph.descriptors import NO_SHAPE, MapShape, shape_of
 from uw_dslam_ros2.core.merging.graph.memory import Memory
@@ -264,7 +264,10 @@ class Library:
     def solve(
         self, anchor: SubmapId, constraints: Sequence[Constraint]
     ) -> tuple[list[Constraint], list[Component]]:
-        """Solve the pose graph; see `components.solve_components`."""
+        """Solve the pose graph; see `solving.solve_components`."""
+        # networkx is large, and not every node that starts has something to solve.
+        from uw_dslam_ros2.core.merging.graph.solving import solve_components
+
         allowed = [
             constraint
             for constraint in constraints
