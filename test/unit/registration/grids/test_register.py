@@ -218,6 +218,14 @@ def test_hopeless_maps_get_a_sentence(values):
         assert "map" in result.reason
 
 
+def test_walls_without_any_free_cell_get_an_answer(harbour):
+    maps = [
+        OccupancyMap(grid.spec, np.where(grid.values > 50, grid.values, -1).astype(np.int8))
+        for grid in (harbour.source, harbour.target)
+    ]
+    assert np.isfinite(register_grids(*maps).probability)
+
+
 def test_an_accepted_match_says_where_its_proof_is_open(harbour):
     config = GridRegistrationConfig(max_boxes=1000, gap=0.001)
     result = register_grids(harbour.source, harbour.target, config)

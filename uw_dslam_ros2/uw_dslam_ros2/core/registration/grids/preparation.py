@@ -89,7 +89,8 @@ def _levels(source: WallMap, target: WallMap, config: GridRegistrationConfig) ->
     least = max(1, math.ceil(sides[1] / (_MOST_SCANNED * num_cells)))
     detail = min(_wall_spacing(walls) for walls in (source, target))
     stride = _cell_size(sides, num_cells, _MOST_SCANNED)
-    strides = [min(stride, max(least, int(detail / _SCANNED_PER_SPACING)))]
+    # Without any free cell the spacing is infinite.
+    strides = [max(min(stride, least), int(min(stride, detail / _SCANNED_PER_SPACING)))]
     while strides[-1] > 1:
         strides.append((strides[-1] + 1) // 2)
     levels = []
