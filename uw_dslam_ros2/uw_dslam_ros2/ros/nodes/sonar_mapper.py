@@ -6,13 +6,11 @@ import functools
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
-from std_srvs.srv import SetBool, Trigger
-from uw_dslam_msgs.srv import GetSubmap
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
@@ -23,16 +21,15 @@ from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed_runs
 from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.readings import PINGS, TransformEvent
-from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
 from uw_dslam_ros2.ros.plumbing.convention_watch import ConventionWatch
 from uw_dslam_ros2.ros.plumbing.diagnostics import Report
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, Transforms
 from uw_dslam_ros2.ros.plumbing.managed_node import ManagedNode
 from uw_dslam_ros2.ros.plumbing.mapper_outputs import MapperOutputs
+from uw_dslam_ros2.ros.plumbing.mapper_services import MapperServices
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
-from uw_dslam_ros2.ros.plumbing.qos import SERVICES
 from uw_dslam_ros2.ros.plumbing.running import run_node
-from uw_dslam_ros2.ros.plumbing.sensor_inputs import SensorInput
+from uw_dslam_ros2.ros.plumbing.sensor_inputs import SensorInput, check_stamp
 from uw_dslam_ros2.ros.plumbing.sensor_silence import SensorSilence
 from uw_dslam_ros2.ros.plumbing.sensor_topics import SensorTopics
 from uw_dslam_ros2.ros.plumbing.stamp_order import StampOrder
@@ -43,10 +40,8 @@ __all__ = ["SonarMapper", "SonarMapperConfig", "main"]
 
 _JUMP_BACK_S = 1.0  # stamps that go back by more are late, or show a clock that was set
 _MANY_DISPLACED = 50
-_MAX_AHEAD_NS = 10_000_000_000
 _MOUNT_PATIENCE_NS = 5_000_000_000
 _ODOM_PERIOD_NS = 100_000_000
-_FINISH_TIMEOUT_S = 600.0
 _LAST_WORD_S, _HEARD_S, _CLOSE_S = 1.0, 0.3, 5.0
 """When told to end: to close the open submap, until who listens has it, for the job at hand."""
 _IDLE_S = 4.0  # longer than the repair of a lost message takes
@@ -107,16 +102,7 @@ class SonarMapper(ManagedNode):
             lambda event: self._worker.post(functools.partial(self._mount, event)),
             callback_group=self._group,
         )
-        services = ReentrantCallbackGroup()
-        for service_type, name, serve in (
-            (Trigger, "~/finish", self._on_finish),
-            (Trigger, "~/reset", self._on_reset),
-            (SetBool, "~/pause", self._on_pause),
-            (GetSubmap, "~/get_submap", self._on_get_submap),
-        ):
-            self.create_service(
-                service_type, name, serve, qos_profile=SERVICES, callback_group=services
-            )
+        MapperServices(self, self, self._worker)
         self.tell_health(self._report, self._vehicle_id)
 
     def begin(self) -> None:
@@ -147,7 +133,7 @@ class SonarMapper(ManagedNode):
         """Give the open submap away, if there is time."""
         if not self._mapper.num_pings or self._is_finished:
             return
-        job = self._worker.call(self._finish)
+        job = self._worker.call(self.finish)
         try:
             job.result(_LAST_WORD_S)
         except Exception as error:  # noqa: BLE001 (it ends in any case)
@@ -199,7 +185,7 @@ class SonarMapper(ManagedNode):
         self._silence.hear(name, time.monotonic())
         now_ns = self.get_clock().now().nanoseconds
         try:
-            self._check_stamp(msg)
+            check_stamp(msg, now_ns)
             said = sensor.to_events(msg, now_ns)
         except InvalidInputError as error:
             self._complain(f"bad message on {name}: {error}")
@@ -218,21 +204,6 @@ class SonarMapper(ManagedNode):
             self._worker.post(functools.partial(self._take, name, stamp_ns, None))
         for event in events:
             self._worker.post(functools.partial(self._take, name, event.stamp_ns, event))
-
-    def _check_stamp(self, msg: Any) -> None:
-        if not hasattr(msg, "header"):
-            return
-        stamp_ns = stamp_of(msg)
-        if stamp_ns <= 0:
-            raise InvalidInputError(
-                f"header.stamp is {stamp_ns * 1e-9} s, expected the time of the measurement"
-            )
-        now_ns = self.get_clock().now().nanoseconds
-        if 0 < now_ns < stamp_ns - _MAX_AHEAD_NS:
-            raise InvalidInputError(
-                f"header.stamp is {(stamp_ns - now_ns) * 1e-9:.1f} s ahead of the clock, "
-                f"expected at most {_MAX_AHEAD_NS * 1e-9:.0f} s"
-            )
 
     def _complain(self, text: str) -> None:
         self._counts["num_bad"] += 1
@@ -357,13 +328,30 @@ class SonarMapper(ManagedNode):
                 self.get_logger().warning(self._last_problem)
         self._num_breaks_told = len(self._runs.breaks)
 
-    def _reset(self) -> str:
+    def _publish_map(self, stamp_ns: int) -> None:
+        self._map_stamp_ns = stamp_ns
+        with self._drawing.turn():
+            self._outputs.publish_map(self._mapper, stamp_ns)
+
+    # --- what the services ask for -----------------------------------------------------------
+
+    def pause(self, is_paused: bool) -> str:
+        """Leave out the pings that come from now on; navigation, and so the run, goes on."""
+        self._is_paused = is_paused
+        return "pings are left out" if is_paused else "pings are mapped"
+
+    def issued(self, vehicle_id: str, run_id: int, sequence: int) -> Submap | None:
+        """A submap as it was given away last; run 0 is the one that goes on."""
+        return self._runs.issued(run_id, sequence) if vehicle_id == self._vehicle_id else None
+
+    def reset(self) -> str:
         """Begin anew; what was mapped before goes to who listens, and stays there."""
         stamp_ns = self._mapper.stamp_ns or 0
         self._begin_run(RunBreak("", stamp_ns, stamp_ns))
         return f"a new run begins; {self._runs.diagnostics()['num_submaps']} submaps lie before it"
 
-    def _finish(self) -> str:
+    def finish(self) -> str:
+        """Close the last submap; nothing is mapped after that."""
         if self._is_finished:
             return "finished before; nothing changes"
         self._flush()
@@ -379,57 +367,7 @@ class SonarMapper(ManagedNode):
             f"{self._mapper_values['num_submaps']} submaps; {self._counts['num_bad']} bad messages"
         )
 
-    def _publish_map(self, stamp_ns: int) -> None:
-        self._map_stamp_ns = stamp_ns
-        with self._drawing.turn():
-            self._outputs.publish_map(self._mapper, stamp_ns)
-
-    # --- services and diagnostics ------------------------------------------------------------
-
-    def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._served("finish", self._finish, response)
-
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._served("reset", self._reset, response)
-
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        # By arrival: what came before is mapped. Navigation goes on, so that the run does.
-        self._is_paused = bool(request.data)
-        response.success = True
-        response.message = "pings are left out" if request.data else "pings are mapped"
-        self.get_logger().info(response.message)
-        return response
-
-    def _served(self, name: str, job: Callable[[], str], response: Any) -> Any:
-        """Answer a request with what a job in the worker's thread says."""
-        try:
-            response.message = self._worker.call(job).result(_FINISH_TIMEOUT_S)
-            response.success = True
-        except Exception as error:  # noqa: BLE001 (the caller gets it)
-            response.success = False
-            response.message = f"{type(error).__name__}: {error}"
-        self.get_logger().info(f"{name}: {response.message}")
-        return response
-
-    def _on_get_submap(
-        self, request: GetSubmap.Request, response: GetSubmap.Response
-    ) -> GetSubmap.Response:
-        """Give a submap again, to whoever did not get it."""
-        try:
-            found = self._worker.call(lambda: self._issued(request)).result(_FINISH_TIMEOUT_S)
-        except Exception as error:  # noqa: BLE001 (the caller gets it)
-            found, response.message = None, f"{type(error).__name__}: {error}"
-        response.result = response.NOT_FOUND
-        if found is not None:
-            response.result, response.submap = response.DONE, submap_to_msg(found)
-        elif not response.message:
-            response.message = f"this run of {self._vehicle_id} has no submap {request.sequence}"
-        return response
-
-    def _issued(self, request: GetSubmap.Request) -> Submap | None:
-        if request.vehicle_id != self._vehicle_id:
-            return None
-        return self._runs.issued(int(request.run_id), int(request.sequence))
+    # --- diagnostics -------------------------------------------------------------------------
 
     def _report(self) -> Report:
         for misfit in self._topics.misfits() if self._topics is not None else ():

@@ -8,20 +8,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io.drivers import ADAPTERS, stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent
 from uw_dslam_ros2.io.topics import topics_of
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 
-__all__ = ["SensorInput", "default_inputs", "found_inputs"]
+__all__ = ["SensorInput", "check_stamp", "default_inputs", "found_inputs"]
 
 _PING_QUEUE = 100
 """Pings kept while the mapper is busy: ten seconds at 10 Hz, and an image is large."""
 _SENSOR_QUEUE = 5000
 """Other messages kept meanwhile: half a minute of a fast IMU; nearly nothing in memory."""
 
+_MAX_AHEAD_NS = 10_000_000_000
 _NAMES = {"velocity": "dvl"}
 _SONARS = {
     "scan": ("scan", "sensor_msgs/msg/LaserScan"),
@@ -127,3 +128,25 @@ def _input(
         return [dataclasses.replace(event, stamp_ns=now_ns) for event in found]
 
     return SensorInput(role, name, topic, msgtype, to_events)
+
+
+def check_stamp(msg: Any, now_ns: int) -> None:
+    """Refuse a message that says no time of measurement, or one far ahead of the clock.
+
+    Raises
+    ------
+    InvalidInputError
+        With the stamp; never for a type without a header.
+    """
+    if not hasattr(msg, "header"):
+        return
+    stamp_ns = stamp_of(msg)
+    if stamp_ns <= 0:
+        raise InvalidInputError(
+            f"header.stamp is {stamp_ns * 1e-9} s, expected the time of the measurement"
+        )
+    if 0 < now_ns < stamp_ns - _MAX_AHEAD_NS:
+        raise InvalidInputError(
+            f"header.stamp is {(stamp_ns - now_ns) * 1e-9:.1f} s ahead of the clock, "
+            f"expected at most {_MAX_AHEAD_NS * 1e-9:.0f} s"
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -84,10 +85,18 @@ def contradicting_map(
         poses = {i: component[i] for i in component if i in submaps}
         if len({i.track for i in poses}) < _MIN_TRACKS:
             continue
-        key = ("contradictions", tuple((i, submaps[i].digest, T) for i, T in poses.items()))
-        blamed += memory.remember_solution(key, partial(_counted, submaps, poses, memory))
+        key = ("contradictions", _digest(submaps, poses))
+        blamed += memory.remember(key, partial(_counted, submaps, poses, memory))
     worst = [one for one in blamed if one.share == max(other.share for other in blamed)]
     return worst[0] if len(worst) == 1 else None
+
+
+def _digest(submaps: Mapping[SubmapId, StoredSubmap], poses: Mapping[SubmapId, SE2]) -> bytes:
+    hasher = hashlib.blake2b(digest_size=16)
+    for submap_id, motion in sorted(poses.items()):
+        hasher.update(submap_id.stable_name.encode() + submaps[submap_id].digest)
+        hasher.update(motion.as_array().tobytes())
+    return hasher.digest()
 
 
 def _counted(
