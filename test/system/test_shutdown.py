@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -85,6 +86,20 @@ def test_a_node_that_still_waits_for_something_is_ended(begin, number):
     process = begin(_BUSY)
     wait_for_line(process, "spinning")
     assert ended_with(process, number) == 0
+
+
+def test_systemd_hears_that_a_node_is_ready_and_alive(begin, tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "notify"))
+        listener.settimeout(START_S)
+        asked = {"NOTIFY_SOCKET": listener.getsockname(), "WATCHDOG_USEC": "300000"}
+        process = begin(f"import os; os.environ.update({asked!r})\n{_BUSY}")
+        said = [listener.recv(100) for _ in range(4)]
+        assert said == [b"READY=1", *3 * [b"WATCHDOG=1"]]
+        process.send_signal(signal.SIGTERM)
+        while (word := listener.recv(100)) == b"WATCHDOG=1":
+            pass
+        assert word == b"STOPPING=1"
 
 
 @pytest.mark.parametrize(

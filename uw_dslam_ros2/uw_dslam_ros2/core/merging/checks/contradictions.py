@@ -28,7 +28,7 @@ _WALL_PERCENT, _FREE_PERCENT = 50, 25
 _MIN_WALLS = 8
 """Cells of wall that others must have seen of a submap, for a judgement."""
 _CONTRADICTED = 0.5
-"""Share of them in others' free water: up to 0.2 in maps that are right, 0.6 and more else."""
+"""Share of them in others' free water: up to 0.4 in maps that are right, 0.6 and more else."""
 _MIN_SUBMAPS = 3
 _MIN_SHARE = 1.0 / 3.0
 _MIN_TRACKS = 3
