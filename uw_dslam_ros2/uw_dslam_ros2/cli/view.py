@@ -32,7 +32,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = parser_for(
         "view",
         "Show a merge in the browser: the global map, vehicles, submaps, constraints, and each\n"
-        "registration with both maps laid on each other. Without FOLDER it follows the\n"
+        "registration with both maps laid on each other. Take what people say of it: withdraw,\n"
+        "forbid, confirm, lay by hand, pin, fix, undo. Without FOLDER it follows the\n"
         "map_queue_manager of the running graph; its parameters may come after --ros-args.",
         "view result",
     )
@@ -68,9 +69,12 @@ def _follow_graph(args: argparse.Namespace, ros_args: Sequence[str]) -> int:
 def _run(args: argparse.Namespace) -> int:
     folder = args.folder
     holder = folder / SESSION_FOLDER if (folder / SESSION_FOLDER).is_dir() else folder
-    source = QueueSource(folder.resolve().name, load_session(holder))
+    source = QueueSource(folder.resolve().name, load_session(holder), holder)
     server = ViewServer(source, args.address, args.port, args.token)
-    asyncio.run(_serve(server))
+    try:
+        asyncio.run(_serve(server))
+    finally:
+        source.close()
     return 0
 
 

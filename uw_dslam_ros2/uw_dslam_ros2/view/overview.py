@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.merging import Constraint, ConstraintKind, SubmapRecord, SubmapState
+from uw_dslam_ros2.core.merging import (
+    Constraint,
+    DecisionRecord,
+    SubmapRecord,
+    SubmapState,
+)
 from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.se2 import SE2
@@ -20,6 +25,7 @@ from uw_dslam_ros2.core.submap import SubmapId
 __all__ = [
     "Names",
     "constraint_row",
+    "decision_row",
     "outline_of",
     "registration_row",
     "submap_row",
@@ -64,11 +70,21 @@ def vehicle_rows(
         submap = record.submap
         name = names.track(submap.submap_id.track)
         row = rows.setdefault(
-            name, {"name": name, "num_submaps": 0, "num_merged": 0, "reason": "", "track": []}
+            name,
+            {
+                "name": name,
+                "id": list(submap.submap_id),
+                "num_submaps": 0,
+                "num_merged": 0,
+                "num_withdrawn": 0,
+                "reason": "",
+                "track": [],
+            },
         )
         row["num_submaps"] += 1
         is_merged = record.state is SubmapState.MERGED
         row["num_merged"] += is_merged
+        row["num_withdrawn"] += record.state is SubmapState.WITHDRAWN
         if not is_merged or not row["reason"]:
             row["reason"] = record.reason
         row["newest_s"] = max(row.get("newest_s", 0.0), submap.stamp_ns * 1e-9)
@@ -91,6 +107,7 @@ def submap_row(
     motion = T_view_group @ record.T_component_submap
     return {
         "name": names.submap(submap.submap_id),
+        "id": list(submap.submap_id),
         "vehicle": names.track(submap.submap_id.track),
         "state": record.state.name.lower(),
         "group": record.component,
@@ -111,7 +128,8 @@ def constraint_row(
         return None
     (group, source), (other, target) = places[constraint.source], places[constraint.target]
     return {
-        "kind": "odometry" if constraint.kind is ConstraintKind.ODOMETRY else "registration",
+        "kind": constraint.kind.name.lower(),
+        "ends": [list(constraint.source), list(constraint.target)],
         "source": names.submap(constraint.source),
         "target": names.submap(constraint.target),
         "group": group if group == other else None,
@@ -132,6 +150,11 @@ def registration_row(
     return {
         "number": number,
         **sides,
+        "references": [list(answer.query.source.reference), list(answer.query.target.reference)],
+        "runs": [
+            names.track(group.reference.track)
+            for group in (answer.query.source, answer.query.target)
+        ],
         "verdict": answer.verdict.name,
         "reason": answer.why,
         "is_used": is_used,
@@ -142,6 +165,33 @@ def registration_row(
         "submaps": sorted(
             {names.submap(i) for i in (*answer.query.source.ids, *answer.query.target.ids)}
         ),
+    }
+
+
+def decision_row(
+    record: DecisionRecord, places: Mapping[SubmapId, tuple[int, SE2]], names: Names
+) -> dict[str, Any]:
+    """One decision, in words, and where it is drawn."""
+    decision = record.decision
+    ends = [end for end in (decision.source, decision.target) if end is not None]
+    name = names.track if decision.is_run else names.submap
+    shown = [name(end.track if decision.is_run else end) for end in ends]  # type: ignore[arg-type]
+    groups = {places[end][0] for end in ends if end in places}
+    at: FloatArray | None = None
+    if ends and not decision.is_run and len(groups) == 1 and all(e in places for e in ends):
+        poses = [places[end][1] for end in ends]
+        at = np.mean([pose.apply(np.array(decision.point)) for pose in poses], axis=0)
+    return {
+        "number": decision.number,
+        "kind": decision.kind.name.lower(),
+        "who": decision.who,
+        "stamp_s": decision.stamp_ns * 1e-9,
+        "ends": shown,
+        "is_run": decision.is_run,
+        "undone": decision.undone,
+        "is_in_force": record.is_in_force,
+        "remark": names.in_text(record.remark),
+        "at": None if at is None else _rounded(at),
     }
 
 

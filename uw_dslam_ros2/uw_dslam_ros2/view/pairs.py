@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.view.tiles import png_bytes
 
-__all__ = ["PAIR_LAYERS", "Pair", "lay_on"]
+__all__ = ["PAIR_LAYERS", "Pair", "lay_on", "map_picture"]
 
 ByteArray = NDArray[np.uint8]
 
@@ -22,6 +23,7 @@ _WALL_PERCENT, _FREE_PERCENT = 65, 20
 _REACH_CELLS = 2
 """Walls so near are the same wall to the eye: their own thickness."""
 _MARGIN_CELLS = 4
+_CLEAR = 90  # opacity, of 255
 # Okabe and Ito's colours, which colour-blind people tell apart: red, green, blue, opacity.
 _COLOURS = {
     "free": (226, 232, 237, 255),
@@ -45,10 +47,7 @@ class Pair:
         if layer == "agreement":
             rgba = self._agreement()
         else:
-            values = self.target if layer == "target" else self.source
-            rgba = np.zeros((*values.shape, 4), np.uint8)
-            rgba[values >= 0] = _COLOURS["free"]
-            rgba[values >= _WALL_PERCENT] = _COLOURS[layer]
+            return map_picture(self.target if layer == "target" else self.source, layer)
         return png_bytes(np.ascontiguousarray(rgba[::-1]))
 
     def _agreement(self) -> ByteArray:
@@ -65,6 +64,28 @@ class Pair:
             rgba[walls[own] & is_free & ~near[other]] = _COLOURS["conflict"]
         rgba[(walls[0] & near[1]) | (walls[1] & near[0])] = _COLOURS["agree"]
         return rgba
+
+
+def map_picture(values: NDArray[np.int8], layer: str, *, is_clear: bool = False) -> bytes:
+    """PNG of a map in the colour of a layer, ``source`` or ``target``, north up.
+
+    Parameters
+    ----------
+    values
+        (R, C), as in `OccupancyMap`.
+    layer
+        Whose colour its walls have.
+    is_clear
+        Let what lies below shine through free water.
+    """
+    if layer not in ("source", "target"):
+        raise InvalidInputError(f"layer is {layer!r}, expected source or target")
+    rgba = np.zeros((*values.shape, 4), np.uint8)
+    rgba[values >= 0] = _COLOURS["free"]
+    if is_clear:
+        rgba[values >= 0, 3] = _CLEAR
+    rgba[values >= _WALL_PERCENT] = _COLOURS[layer]
+    return png_bytes(np.ascontiguousarray(rgba[::-1]))
 
 
 def lay_on(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> Pair:

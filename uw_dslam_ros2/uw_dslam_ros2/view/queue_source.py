@@ -1,36 +1,153 @@
-"""A queue that rests, such as that of a saved session, as what a view shows."""
+"""A queue that rests, such as that of a saved session, as what a view shows and people change."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+from uw_dslam_ros2.core.errors import DataError, UwDslamError
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.core.merging import Decision, MapQueue
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
+from uw_dslam_ros2.io.session import Session
 from uw_dslam_ros2.view.showing import Register, Showing
 
 __all__ = ["QueueSource", "register_by_engine"]
 
 
 class QueueSource:
-    """A queue that does not change."""
+    """A queue that changes only by what people decide.
 
-    def __init__(self, title: str, queue: MapQueue) -> None:
+    What a decision asks for is registered in a thread of its own, by the engine.
+
+    Parameters
+    ----------
+    title
+        For the page's head.
+    queue
+        That is shown.
+    folder
+        Session that decisions are saved in. It is taken, and read anew, with the first decision:
+        who only looks is in nobody's way.
+    """
+
+    def __init__(self, title: str, queue: MapQueue, folder: Path | None = None) -> None:
         self.title = title
+        self._queue, self._folder = queue, folder
+        self._session: Session | None = None
         self._showing = Showing.of_queue(queue)
+        self._lock = threading.Lock()
+        self._worker: threading.Thread | None = None
+        self._trouble = ""
+        self._on_change: Callable[[], None] = lambda: None
 
     def showing(self) -> Showing:
-        """The only state."""
+        """The newest state."""
         return self._showing
 
     def status(self) -> dict[str, Any]:
-        """Nothing changes."""
-        return {"is_live": False}
+        """What goes on."""
+        is_busy = self._worker is not None and self._worker.is_alive()
+        notes = ["registering what the decisions ask for …"] if is_busy else []
+        return {"is_live": False, "notes": [*notes, *filter(None, [self._trouble])]}
 
     def register(self) -> Register:
         """The engine itself."""
         return register_by_engine
+
+    def listen(self, on_change: Callable[[], None]) -> None:
+        """Have something called when the queue has changed."""
+        self._on_change = on_change
+
+    def decide(self, decision: Decision) -> Decision:
+        """Write it down, save it, and work out what follows.
+
+        Raises
+        ------
+        InvalidInputError
+            If it makes no sense.
+        DataError
+            If it cannot be saved; then it does not hold.
+        """
+        with self._lock:
+            if self._folder is not None and self._session is None:
+                self._take(self._folder)
+            taken = self._queue.decide(
+                dataclasses.replace(decision, stamp_ns=time.time_ns(), number=0)
+            )
+            try:
+                self._save()
+            except DataError:
+                self._take_back()
+                raise
+            self._show()
+            if self._worker is None or not self._worker.is_alive():
+                self._worker = threading.Thread(target=self._settle, name="settle", daemon=True)
+                self._worker.start()
+        return taken
+
+    def close(self) -> None:
+        """Let others have the session."""
+        with self._lock:
+            if self._session is not None:
+                self._session.close()
+                self._session = None
+
+    def _take(self, folder: Path) -> None:
+        """Take the session for writing, as it is now."""
+        session = Session(folder)
+        queue = session.load()
+        self._session = session
+        if queue is not None:
+            self._queue = queue
+
+    def _take_back(self) -> None:
+        """Go back to what is saved."""
+        assert self._session is not None
+        with contextlib.suppress(DataError):
+            queue = self._session.load()
+            if queue is not None:
+                self._queue = queue
+
+    def _save(self) -> None:
+        if self._session is not None:
+            self._session.save(self._queue)
+
+    def _show(self) -> None:
+        self._showing = Showing.of_queue(self._queue, self._showing)
+        self._on_change()
+
+    def _settle(self) -> None:
+        """Answer all that is open; others may decide meanwhile."""
+        while True:
+            with self._lock:
+                requests = self._queue.next_requests(1)
+                if not requests:
+                    self._trouble = ""
+                    try:
+                        self._save()
+                    except DataError as error:
+                        self._trouble = str(error)
+                    self._worker = None
+                    self._show()
+                    return
+            (request,) = requests
+            try:
+                result = register_by_engine(request.source, request.target, request.prior)
+            except UwDslamError as error:
+                with self._lock:
+                    self._queue.cancel_request(request.request_id)
+                    self._trouble, self._worker = str(error), None
+                    self._show()
+                return
+            with self._lock:
+                self._queue.add_result(request.request_id, result)
 
 
 def register_by_engine(

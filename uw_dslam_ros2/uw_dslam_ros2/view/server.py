@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import hmac
 import ipaddress
 import json
 import secrets
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from typing import Any, Protocol
@@ -16,7 +17,10 @@ from typing import Any, Protocol
 from aiohttp import web
 
 from uw_dslam_ros2.core.errors import InvalidInputError, UwDslamError
+from uw_dslam_ros2.core.merging import Decision
+from uw_dslam_ros2.io.decisions import decision_from_plain
 from uw_dslam_ros2.view.export import export_zip
+from uw_dslam_ros2.view.laying import lay_out, run_map
 from uw_dslam_ros2.view.pairs import PAIR_LAYERS, Pair
 from uw_dslam_ros2.view.showing import Register, Showing
 from uw_dslam_ros2.view.tiles import tile_png
@@ -34,6 +38,7 @@ _HEADERS = {
 }
 _MAX_ZOOM, _MIN_ZOOM = 10, -8
 _MAX_PAIRS = 8
+_MAX_BODY_BYTES = 10_000
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -53,6 +58,15 @@ class Source(Protocol):
 
     def register(self) -> Register:
         """How a pair is registered once more."""
+
+    def decide(self, decision: Decision) -> Decision:
+        """Write down what a person decided; its number and time are given here.
+
+        Raises an error that says why it cannot be.
+        """
+
+    def listen(self, on_change: Callable[[], None]) -> None:
+        """Have something called, in any thread, whenever what is shown has changed."""
 
 
 def is_loopback(address: str) -> bool:
@@ -98,7 +112,7 @@ class ViewServer:
 
     async def start(self) -> str:
         """Listen; returns the page's address for a browser."""
-        app = web.Application(middlewares=[self._guard])
+        app = web.Application(middlewares=[self._guard], client_max_size=_MAX_BODY_BYTES)
         app.add_routes(
             [
                 web.get("/", self._page),
@@ -107,6 +121,9 @@ class ViewServer:
                 web.get("/api/status", self._status),
                 web.get("/api/events", self._events),
                 web.get("/api/cell", self._cell),
+                web.get("/api/lay", self._lay),
+                web.get("/api/lay.png", self._lay_picture),
+                web.post("/api/decide", self._decide),
                 web.get("/api/export.zip", self._export),
                 web.get("/api/tiles/{version}/{moment}/{zoom}/{col}/{row}.png", self._tile),
                 web.get("/api/pairs/{number}", self._pair),
@@ -114,6 +131,8 @@ class ViewServer:
                 web.get("/api/pairs/{number}/{layer}.png", self._pair_picture),
             ]
         )
+        loop = asyncio.get_running_loop()
+        self._source.listen(lambda: _call_in(loop, self.notify))
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await self._runner.setup()
         site = web.TCPSite(self._runner, self._address, self._port)
@@ -149,7 +168,7 @@ class ViewServer:
             return refused
         try:
             response = await handler(request)
-        except (UwDslamError, ValueError) as error:
+        except (UwDslamError, ValueError, TimeoutError) as error:
             response = web.json_response({"error": str(error)}, status=400)
         if not response.prepared:
             response.headers.update(_HEADERS)
@@ -164,6 +183,14 @@ class ViewServer:
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"{request.scheme}://{request.host}":
             return web.Response(status=403, text="pages of other sites may not ask this view")
+        if request.method not in ("GET", "HEAD") and (
+            origin is None or request.content_type != "application/json"
+        ):
+            # Browsers say where what changes something comes from; a form cannot send this type.
+            return web.Response(
+                status=403,
+                text="only the view's own page may change it: JSON, with an Origin",
+            )
         if not self._token:
             return None
         given = request.query.get("token") or request.cookies.get(_COOKIE, "")
@@ -226,6 +253,30 @@ class ViewServer:
         x_m, y_m = float(request.query["x"]), float(request.query["y"])
         found = await self._in_thread(lambda: self._source.showing().cell(x_m, y_m))
         return web.json_response(found)
+
+    async def _lay(self, request: web.Request) -> web.StreamResponse:
+        query = request.query
+        number = int(query["match"]) if "match" in query else None
+
+        def work() -> dict[str, Any]:
+            return lay_out(self._source.showing(), query["source"], query["target"], number)
+
+        return web.json_response(await self._in_thread(work))
+
+    async def _lay_picture(self, request: web.Request) -> web.StreamResponse:
+        name, layer = request.query["run"], request.query["layer"]
+        body = await self._in_thread(lambda: run_map(self._source.showing(), name).picture(layer))
+        return web.Response(body=body, content_type="image/png")
+
+    async def _decide(self, request: web.Request) -> web.StreamResponse:
+        plain = await request.json()
+        if not isinstance(plain, dict):
+            raise InvalidInputError(f"the decision is {plain!r}, expected an object")
+        if not str(plain.get("who", "")).strip():
+            raise InvalidInputError("decision.who is empty, expected who decides")
+        decision = decision_from_plain(plain)
+        taken = await self._in_thread(lambda: self._source.decide(decision))
+        return web.json_response({"number": taken.number})
 
     async def _export(self, _request: web.Request) -> web.StreamResponse:
         body = await self._in_thread(lambda: export_zip(self._source.showing()))
@@ -300,6 +351,14 @@ class ViewServer:
     async def _in_thread(self, work: Callable[[], Any]) -> Any:
         """One at a time, beside the loop, which goes on answering."""
         return await asyncio.get_running_loop().run_in_executor(self._pool, work)
+
+
+def _call_in(
+    loop: asyncio.AbstractEventLoop, work: Callable[[], Coroutine[Any, Any, None]]
+) -> None:
+    """Have something done in a loop, which may have ended."""
+    with contextlib.suppress(RuntimeError):
+        loop.call_soon_threadsafe(lambda: loop.create_task(work()))
 
 
 def _is_own_name(host: str) -> bool:

@@ -14,6 +14,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import (
     Constraint,
+    DecisionRecord,
     MapQueue,
     SubmapRecord,
     SubmapState,
@@ -28,6 +29,7 @@ from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.view.overview import (
     Names,
     constraint_row,
+    decision_row,
     outline_of,
     registration_row,
     submap_row,
@@ -58,6 +60,10 @@ class Showing:
         Each answer, and whether it holds in the graph.
     before
         The state shown until now.
+    decisions
+        What people decided, and what became of it.
+    georeference
+        Name of coordinates on earth, and where the global map lies in them.
     """
 
     def __init__(
@@ -66,10 +72,13 @@ class Showing:
         constraints: Sequence[Constraint],
         answers: Sequence[tuple[Answer, bool]] = (),
         before: Showing | None = None,
+        decisions: Sequence[DecisionRecord] = (),
+        georeference: tuple[str, SE2] | None = None,
     ) -> None:
         self.records = list(records)
         self.names = Names(self.records)
         self.constraints = list(constraints)
+        self.decisions, self.georeference = list(decisions), georeference
         self._answers = list(answers)
         self._stored: dict[SubmapId, StoredSubmap] = dict(before._stored) if before else {}
         self._outlines: dict[SubmapId, FloatArray] = dict(before._outlines) if before else {}
@@ -91,7 +100,15 @@ class Showing:
     @classmethod
     def of_queue(cls, queue: MapQueue, before: Showing | None = None) -> Showing:
         """What a queue holds now."""
-        return cls(queue.submaps(), queue.constraints(), queue.answers(), before)
+        found = queue.georeference()
+        return cls(
+            queue.submaps(),
+            queue.constraints(),
+            queue.answers(),
+            before,
+            queue.decisions(),
+            None if found is None else (found.earth_frame, found.T_earth_map),
+        )
 
     @property
     def num_moments(self) -> int:
@@ -130,6 +147,12 @@ class Showing:
                 for r in self.records
             ],
             "constraints": [row for row in constraints if row is not None],
+            "decisions": [decision_row(record, places, self.names) for record in self.decisions],
+            "earth": self.georeference
+            and {
+                "frame": self.georeference[0],
+                "pose": self.georeference[1].as_array().round(6).tolist(),
+            },
             "registrations": [
                 registration_row(number, answer, is_used, self._sides(answer), self.names)
                 for number, (answer, is_used) in enumerate(self._answers, start=1)
@@ -157,13 +180,16 @@ class Showing:
         """What is known of the cell under a place of the page; None where nothing is."""
         for group, T_view_group in self._T_view_group.items():
             place = T_view_group.inverse().apply(np.array([[x_m, y_m]]))
-            seen_by = {}
+            seen_by, points = {}, {}
             for record in self.records:
                 if record.component != group or record.state is SubmapState.WITHDRAWN:
                     continue
                 value = _value_at(record, place)
                 if value is not None:
-                    seen_by[self.names.submap(record.submap.submap_id)] = value
+                    submap_id = record.submap.submap_id
+                    own = record.T_component_submap.inverse().apply(place[0])
+                    seen_by[self.names.submap(submap_id)] = value
+                    points[self.names.submap(submap_id)] = [list(submap_id), own.tolist()]
             if seen_by:
                 votes = [value > 50 for value in seen_by.values()]
                 return {
@@ -171,6 +197,7 @@ class Showing:
                     "x_m": round(float(place[0, 0]), 3),
                     "y_m": round(float(place[0, 1]), 3),
                     "percent": seen_by,
+                    "points": points,
                     "num_occupied": sum(votes),
                     "num_free": len(votes) - sum(votes),
                 }
@@ -186,7 +213,7 @@ class Showing:
         InvalidInputError
             If there is no such answer, or no pose in it.
         """
-        answer = self._answer(number)
+        answer = self.answer(number)
         motion = answer.T_target_source
         if rival is not None and register is not None:
             others = self.result(number, register).rivals
@@ -202,11 +229,16 @@ class Showing:
 
     def result(self, number: int, register: Register) -> RegistrationResult:
         """Register the pair of an answer once more, for what an answer does not keep: rivals."""
-        answer = self._answer(number)
+        answer = self.answer(number)
         source, target = self._pair_maps(answer)
         return register(source, target, answer.query.prior)
 
-    def _answer(self, number: int) -> Answer:
+    def stored(self, submap_id: SubmapId) -> StoredSubmap:
+        """A submap that is shown."""
+        return self._stored[submap_id]
+
+    def answer(self, number: int) -> Answer:
+        """A registration by its number, counted from 1."""
         if not 1 <= number <= len(self._answers):
             raise InvalidInputError(
                 f"registration is {number}, there are {len(self._answers)}, counted from 1"
@@ -214,10 +246,11 @@ class Showing:
         return self._answers[number - 1][0]
 
     def _pair_maps(self, answer: Answer) -> tuple[OccupancyMap, OccupancyMap]:
-        source, target = self._rendered(answer.query.source), self._rendered(answer.query.target)
+        source, target = self.rendered(answer.query.source), self.rendered(answer.query.target)
         return source, target
 
-    def _rendered(self, group: SubmapGroup) -> OccupancyMap:
+    def rendered(self, group: SubmapGroup) -> OccupancyMap:
+        """The map of a group; an error where its submaps are not here, or empty."""
         missing = [self.names.submap(i) for i in group.ids if i not in self._stored]
         if missing:
             raise InvalidInputError(f"the submaps {', '.join(missing)} are not here any more")
@@ -321,6 +354,7 @@ class Showing:
                 repr((constraint.source, constraint.target, constraint.is_inlier)).encode()
             )
         hasher.update(repr([answer.query.key for answer, _ in self._answers]).encode())
+        hasher.update(repr((self.decisions, self.georeference)).encode())
         return hasher.hexdigest()
 
 

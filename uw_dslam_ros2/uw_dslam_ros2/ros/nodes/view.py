@@ -1,23 +1,26 @@
-"""The view of a running graph: asks the manager, shows the page; decides nothing itself."""
+"""The view of a running graph: asks the manager, tells it what people decide, shows the page."""
 
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from uw_dslam_msgs.msg import MergeStatus
-from uw_dslam_msgs.srv import GetSubmap, ListRegistrations
+from uw_dslam_msgs.srv import Decide, GetSubmap, ListDecisions, ListRegistrations
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.merging import Decision, DecisionRecord
 from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
-from uw_dslam_ros2.ros.convert.core_types import submap_from_msg
+from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, transform2d_from_msg
+from uw_dslam_ros2.ros.convert.decisions import decision_record_from_msg, decision_to_msg
 from uw_dslam_ros2.ros.convert.merging import (
     answer_from_msg,
     constraint_from_msg,
@@ -58,9 +61,12 @@ class View(Node):
         self._list_registrations = self._client(
             ListRegistrations, f"{manager}/list_registrations", group
         )
+        self._decide = self._client(Decide, f"{manager}/decide", group)
+        self._list_decisions = self._client(ListDecisions, f"{manager}/list_decisions", group)
         self._submaps: dict[SubmapId, Submap] = {}
         self._answers: list[tuple[Answer, bool]] = []
         self._num_answers = -1
+        self._on_change: Callable[[], None] = lambda: None
         self._showing = Showing([], [])
         self._status: MergeStatus | None = None
         self._heard_s = float("-inf")
@@ -118,6 +124,27 @@ class View(Node):
         """The engine itself: servers are there for the merge."""
         return register_by_engine
 
+    def listen(self, on_change: Callable[[], None]) -> None:
+        """Have something called when the state has changed."""
+        self._on_change = on_change
+
+    def decide(self, decision: Decision) -> Decision:
+        """Have the manager write it down; what follows comes with its next status.
+
+        Raises
+        ------
+        InvalidInputError
+            With the manager's reason to refuse it.
+        TimeoutError
+            If the manager does not answer.
+        """
+        stamp_ns = int(self.get_clock().now().nanoseconds)
+        msg = decision_to_msg(dataclasses.replace(decision, stamp_ns=stamp_ns, number=0))
+        response = self._ask(self._decide, Decide.Request(decision=msg))
+        if response.result != response.DONE:
+            raise InvalidInputError(response.message)
+        return dataclasses.replace(decision, stamp_ns=stamp_ns, number=int(response.number))
+
     def stop(self) -> None:
         """End both threads."""
         self._is_stopped.set()
@@ -168,10 +195,20 @@ class View(Node):
             self._answers = [answer_from_msg(msg) for msg in response.registrations]
             self._num_answers = status.num_registrations
         constraints = [constraint_from_msg(msg) for msg in status.constraints]
-        showing = Showing(records, constraints, self._answers, self._showing)
+        decisions: list[DecisionRecord] = []
+        georeference = None
+        if status.num_decisions:
+            listed = self._ask(self._list_decisions, ListDecisions.Request())
+            decisions = [decision_record_from_msg(msg) for msg in listed.decisions]
+            if listed.earth_frame:
+                T_earth_map = transform2d_from_msg(listed.t_earth_map, "t_earth_map")
+                georeference = listed.earth_frame, T_earth_map
+        showing = Showing(
+            records, constraints, self._answers, self._showing, decisions, georeference
+        )
         if showing.version != self._showing.version:
             self._showing = showing
-            asyncio.run_coroutine_threadsafe(self._server.notify(), self._loop)
+            self._on_change()
 
     def _fetch(self, submap_id: SubmapId) -> Submap:
         request = GetSubmap.Request(

@@ -9,6 +9,16 @@ export async function ask(path) {
   return body;
 }
 
+/** Have something changed; the server wants JSON from its own page. */
+export async function tell(path, body) {
+  const response = await fetch(path, {
+    method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
+  });
+  const said = await response.json().catch(() => null);
+  if (!response.ok) throw new Error((said && said.error) || `${path}: ${response.status}`);
+  return said;
+}
+
 /** Calls back when something has changed, and when the connection comes or goes. */
 export function listen(onChange, onConnection) {
   const events = new EventSource("/api/events");
@@ -39,6 +49,10 @@ export function style_of(index) {
     color: COLOURS[index % COLOURS.length],
     dash: index < COLOURS.length ? null : "7 4",
   };
+}
+
+export function day(seconds) {
+  return new Date(seconds * 1000).toISOString().slice(0, 10);
 }
 
 export function clock(seconds) {

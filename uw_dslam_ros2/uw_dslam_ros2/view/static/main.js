@@ -1,4 +1,6 @@
 import { ask, clock, listen } from "./api.js";
+import { Hand } from "./hand.js";
+import { LayDialog } from "./lay.js";
 import { MapView } from "./map.js";
 import { PairDialog } from "./pair.js";
 import { Panel } from "./panel.js";
@@ -8,7 +10,10 @@ let scene = null;
 let isBusy = false;
 let isStale = false;
 
-const dialog = new PairDialog();
+const hand = new Hand(at("hand"), at("who"), at("said"));
+const laying = new LayDialog(hand);
+const lay = (runs, match) => laying.open(scene.vehicles.map((vehicle) => vehicle.name), runs, match);
+const dialog = new PairDialog(hand, lay);
 const panel = new Panel(at("tabs"), at("content"), {
   toggle: (name, isOn) => map.toggle(name, isOn),
   zoom: (name) => {
@@ -21,7 +26,8 @@ const panel = new Panel(at("tabs"), at("content"), {
     map.highlight(scene.constraints.filter((edge) => belongs(edge, row)).map((edge) => edge.line));
     dialog.open(row);
   },
-});
+  lay: () => lay(),
+}, hand);
 const map = new MapView("map", select, async (x, y) => panel.showCell(await map.cell(x, y)));
 
 function belongs(edge, row) {
@@ -33,12 +39,20 @@ function select(kind, which) {
     panel.showSubmap(which);
     return;
   }
+  if (kind === "decision") {
+    panel.showDecision(which);
+    return;
+  }
   const edge = scene.constraints[which];
   map.highlight([edge.line]);
+  if (edge.kind === "confirmed") {
+    panel.open("decisions");
+    return;
+  }
   // Of the answers about these two submaps, the one that holds and is of the fewest others.
   const rows = scene.registrations.filter((row) => belongs(edge, row));
   rows.sort((a, b) => Number(b.is_used) - Number(a.is_used) || a.submaps.length - b.submaps.length);
-  if (rows.length) dialog.open(rows[0]);
+  if (rows.length) dialog.open(rows[0], edge);
   else panel.open("matches");
 }
 

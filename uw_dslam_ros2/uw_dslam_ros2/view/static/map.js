@@ -1,6 +1,9 @@
 // The map: tiles of cells, tracks, submaps and constraints.
 /* global L */
 import { ask, style_of } from "./api.js";
+import { worded } from "./hand.js";
+
+const MARKS = { confirm: "◆", forbid: "✕", pin: "⌂", fix: "✚" }; // what a person decided
 
 const GOOD_M = 0.3; // a constraint that is left with more than this is drawn as one that pulls
 
@@ -20,6 +23,7 @@ export class MapView {
     const note = L.control({ position: "bottomright" });
     note.onAdd = () => (this.note = L.DomUtil.create("div", "scale-note"));
     note.addTo(this.map);
+    window.uwView = this; // for who looks at the page from its console, and for its tests
     this.map.setView([0, 0], 3);
     this.map.on("click", (event) => onCell(event.latlng.lng, event.latlng.lat));
     this.map.on("mousemove", (event) => this.#tell(event.latlng));
@@ -58,6 +62,12 @@ export class MapView {
       line.on("click", (event) => { L.DomEvent.stop(event); this.onSelect("constraint", index); });
       line.addTo(this.groups.constraints);
     });
+    for (const row of scene.decisions.filter((d) => d.is_in_force && d.at && MARKS[d.kind])) {
+      const icon = L.divIcon({ className: "decided", iconSize: null, iconAnchor: [8, 9], html: text(MARKS[row.kind]) });
+      const mark = L.marker(swap(row.at), { icon, keyboard: true, title: worded(row) });
+      mark.on("click", () => this.onSelect("decision", row.number));
+      mark.addTo(this.groups.constraints);
+    }
     for (const group of scene.groups.length > 1 ? scene.groups : []) {
       const [x0, , x1, y1] = group.bounds;
       L.marker([y1, (x0 + x1) / 2], { interactive: false, icon: L.divIcon({ className: "scale-note", iconSize: null, html: text(`${group.frame}: ${group.vehicles.join(", ")}`) }) }).addTo(this.groups.names);
@@ -125,6 +135,7 @@ function text(value) {
 }
 
 function look(edge) {
+  if (edge.kind === "confirmed") return { color: "#5b2a86", weight: 4, dashArray: "12 4 2 4" };
   if (!edge.is_inlier) return { color: "#cc2800", weight: 2, dashArray: "2 5" };
   if (edge.is_unsure) return { color: "#8a6d00", weight: 2.5, dashArray: "8 4" };
   return { color: edge.residual_m > GOOD_M ? "#d55e00" : "#00704f", weight: 2.5 };
@@ -132,6 +143,6 @@ function look(edge) {
 
 export function told(edge) {
   const left = edge.residual_m === null ? "" : `, ${edge.residual_m.toFixed(2)} m and ${edge.residual_deg.toFixed(2)}° left`;
-  const state = !edge.is_inlier ? "taken out: it contradicts the others" : edge.is_unsure ? "refused by itself, believed because others agree" : "holds";
+  const state = edge.kind === "confirmed" ? "confirmed by a person" : !edge.is_inlier ? "taken out: it contradicts the others" : edge.is_unsure ? "refused by itself, believed because others agree" : "holds";
   return `${edge.source} – ${edge.target}: ${state}${left}`;
 }

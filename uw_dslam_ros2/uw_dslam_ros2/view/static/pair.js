@@ -9,7 +9,10 @@ const LEGEND = [
 const at = (id) => document.getElementById(id);
 
 export class PairDialog {
-  constructor() {
+  /** `onLay` is called with the names of two runs and a registration's number. */
+  constructor(hand, onLay) {
+    this.hand = hand;
+    this.onLay = onLay;
     at("pair-close").onclick = () => at("pair").close();
     at("pair-slider").oninput = () => this.#clip();
     for (const [mode, name] of Object.entries(MODES)) {
@@ -23,8 +26,11 @@ export class PairDialog {
     }
   }
 
-  async open(row) {
+  /** `edge` is the constraint that was clicked on, if one was. */
+  async open(row, edge = null) {
     this.row = row;
+    this.ends = edge ? edge.ends : row.references;
+    this.rivals = [];
     this.rival = null;
     at("pair-title").textContent = `${row.source} in ${row.target}`;
     const chip = element("span", { className: `chip ${row.verdict === "ACCEPTED" ? "good" : ""}` }, row.verdict);
@@ -36,7 +42,11 @@ export class PairDialog {
     for (const [name, value] of Object.entries(row.numbers)) rows.push([name.replaceAll("_", " "), show(value)]);
     at("pair-numbers").replaceChildren(...rows.map(([name, value]) => element("tr", {}, element("th", { scope: "row" }, name), element("td", {}, String(value)))));
     at("pair-rivals").replaceChildren();
-    if (!at("pair").open) at("pair").showModal();
+    this.#hand();
+    if (!at("pair").open) {
+      this.hand.into(at("pair"));
+      at("pair").showModal();
+    }
     if (!row.pose) {
       at("pair-stage").replaceChildren("There is no pose to draw.");
       return;
@@ -46,12 +56,44 @@ export class PairDialog {
     this.#draw();
   }
 
+  /** What a person may say of the pair. */
+  #hand() {
+    const [source, target] = this.ends;
+    const runs = this.row.runs;
+    const tools = [this.#closing(this.hand.button("forbid this match", { kind: "forbid", source, target }))];
+    if (runs[0] !== runs[1]) {
+      tools.push(this.#closing(this.hand.button(`never match ${runs[0]} with ${runs[1]}`, { kind: "forbid", is_run: true, source, target })));
+    }
+    if (this.row.pose) tools.push(this.#closing(this.hand.button("confirm this pose", () => this.#confirmed())));
+    if (runs[0] !== runs[1]) {
+      const lay = element("button", { type: "button", className: "tool", onclick: () => { at("pair").close(); this.onLay(runs, this.row.number); } }, "lay by hand …");
+      tools.push(lay);
+    }
+    at("pair-hand").replaceChildren(...tools);
+  }
+
+  /** What is drawn: the answer's pose or a rival's. */
+  #confirmed() {
+    const [source, target] = this.row.references;
+    const pose = this.rival === null ? this.row.pose : this.rivals[this.rival].pose;
+    const [x, y, yaw] = this.row.sigma;
+    const sigma_m = Math.max(x || 0, y || 0) || 0.5;
+    return { kind: "confirm", source, target, T_target_source: pose, sigma_m, sigma_rad: yaw || 0.05 };
+  }
+
+  #closing(button) {
+    const act = button.onclick;
+    button.onclick = async () => { if (await act()) at("pair").close(); };
+    return button;
+  }
+
   async #rivals(button) {
     button.disabled = true;
     button.textContent = "registering once more …";
     const number = this.row.number;
     try {
       const rivals = await ask(`/api/pairs/${number}/rivals`);
+      this.rivals = rivals;
       if (this.row.number !== number) return;
       const choose = (rival, made) => {
         this.rival = rival;

@@ -1,12 +1,14 @@
 // The lists beside the map.
-import { attributes, clock, element, style_of } from "./api.js";
+import { attributes, clock, day, element, style_of } from "./api.js";
+import { worded } from "./hand.js";
 import { told } from "./map.js";
 
-const TABS = { vehicles: "Vehicles", matches: "Matches", submaps: "Submaps", cell: "Cell" };
+const TABS = { vehicles: "Vehicles", matches: "Matches", submaps: "Submaps", cell: "Cell", decisions: "Decisions" };
 const LAYERS = { tracks: "tracks", submaps: "submaps", constraints: "matches", odometry: "odometry" };
 
 export class Panel {
-  constructor(tabs, content, actions) {
+  constructor(tabs, content, actions, hand) {
+    this.hand = hand;
     this.tabs = tabs;
     this.content = content;
     this.actions = actions;
@@ -27,7 +29,8 @@ export class Panel {
 
   show(scene) {
     this.scene = scene;
-    this.open(this.current);
+    // What somebody is writing is not taken away.
+    if (!this.content.querySelector("details[open]")) this.open(this.current);
   }
 
   open(name, isFocused = false) {
@@ -53,6 +56,12 @@ export class Panel {
     if (card) card.scrollIntoView({ block: "center" });
   }
 
+  showDecision(number) {
+    this.open("decisions");
+    const card = this.content.querySelector(`[data-number="${number}"]`);
+    if (card) card.scrollIntoView({ block: "center" });
+  }
+
   _vehicles() {
     const choices = Object.entries(LAYERS).map(([name, label]) => {
       const box = element("input", { type: "checkbox", checked: this.layers[name], onchange: () => { this.layers[name] = box.checked; this.actions.toggle(name, box.checked); } });
@@ -63,11 +72,15 @@ export class Panel {
       swatch.style.background = style_of(index).color;
       const isMerged = vehicle.num_merged > 0;
       const age = (this.status.ages || {})[vehicle.name];
-      return element("button", { className: "card", onclick: () => this.actions.zoom(vehicle.name) },
+      const isOut = vehicle.num_withdrawn === vehicle.num_submaps;
+      const run = { source: vehicle.id, is_run: true };
+      const tools = element("div", { className: "tools" }, this.hand.button(isOut ? "restore the run" : "withdraw the run", { kind: isOut ? "restore" : "withdraw", ...run }));
+      const card = element("button", { className: "card", onclick: () => this.actions.zoom(vehicle.name) },
         swatch, element("b", {}, vehicle.name), " ",
         element("span", { className: `chip ${isMerged ? "good" : ""}` }, isMerged ? "merged" : "by itself"),
         element("small", {}, `${vehicle.num_merged} of ${vehicle.num_submaps} submaps in the map${age === undefined ? "" : `, last message ${age.toFixed(0)} s ago`}`),
         element("small", {}, vehicle.reason));
+      return element("div", {}, card, tools);
     });
     const notes = (this.status.notes || []).map((note) => element("p", { className: "card" }, note));
     return [element("fieldset", {}, ...choices), ...cards, ...notes];
@@ -90,9 +103,28 @@ export class Panel {
         element("span", { className: `chip ${submap.state === "merged" ? "good" : "off"}` }, submap.state),
         element("small", {}, `revision ${submap.revision}, ${submap.is_final ? "closed" : "still growing"}, ${clock(submap.stamp_s)}`),
         element("small", {}, submap.reason));
+      const isOut = submap.state === "withdrawn";
+      const switched = this.hand.button(isOut ? "restore" : "withdraw", { kind: isOut ? "restore" : "withdraw", source: submap.id });
+      const pin = this.hand.button("pin the frame here", { kind: "pin", source: submap.id });
+      card.append(element("div", { className: "tools" }, switched, ...(isOut ? [] : [pin])), ...(isOut ? [] : [this.hand.fixForm(submap.id, [0, 0])]));
       card.dataset.name = submap.name;
       return card;
     });
+  }
+
+  _decisions() {
+    const lay = element("button", { type: "button", className: "tool", disabled: this.scene.vehicles.length < 2, onclick: () => this.actions.lay() }, "lay one map on another …");
+    const earth = this.scene.earth && element("p", { className: "card" }, `The map lies on earth (${this.scene.earth.frame}): x ${this.scene.earth.pose[0].toFixed(2)} m, y ${this.scene.earth.pose[1].toFixed(2)} m, turned by ${(this.scene.earth.pose[2] * 180 / Math.PI).toFixed(2)}°.`);
+    const cards = [...this.scene.decisions].reverse().map((row) => {
+      const card = element("div", { className: row.is_in_force ? "card" : "card undone" },
+        element("b", {}, `${row.number}: ${worded(row)}`),
+        element("small", {}, `${row.who || "somebody"}, ${day(row.stamp_s)} ${clock(row.stamp_s)}`),
+        ...(row.remark ? [element("small", {}, row.remark)] : []));
+      if (row.is_in_force) card.append(element("div", { className: "tools" }, this.hand.button("undo", { kind: "undo", undone: row.number })));
+      card.dataset.number = row.number;
+      return card;
+    });
+    return [element("div", { className: "tools" }, lay), ...(earth ? [earth] : []), ...(cards.length ? cards : ["Nobody has decided anything yet."])];
   }
 
   _cell() {
@@ -103,6 +135,7 @@ export class Panel {
       element("p", {}, `x ${this.found.x_m} m, y ${this.found.y_m} m`),
       element("p", {}, `${this.found.num_occupied} submaps say wall, ${this.found.num_free} say free`),
       element("table", {}, ...rows),
+      this.hand.fixForm(...Object.values(this.found.points)[0]),
     ];
   }
 }
