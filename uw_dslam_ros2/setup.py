@@ -36,6 +36,7 @@ setup(
         (f"share/{NAME}/config/systemd", sorted(glob("config/systemd/*"))),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest", "pytest-timeout", "hypothesis"]},
     zip_safe=True,
     maintainer="uw_dslam maintainers",
     maintainer_email="maintainers@users.noreply.github.com",

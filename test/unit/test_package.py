@@ -100,3 +100,20 @@ def test_the_folder_alone_installs_its_launch_files_and_settings(tmp_path):
     assert {"package.xml", "vehicles.launch.py", "aggregator.yaml", "uw_dslam.rviz"} <= files
     assert {path.name for path in (ROOT / "config").glob("*.yaml")} <= files
     assert "sonar_mapper.yaml" in files
+
+
+def test_colcon_finds_the_tests_of_the_checkout():
+    """It runs pytest in the package's folder, where a part of them stands for all."""
+    text = (PACKAGE / "setup.py").read_text()
+    assert '"test": ["pytest"' in text, "colcon takes pytest where the package asks for it"
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q"]
+    done = subprocess.run(
+        [*command, "-o", "testpaths=../test/unit/core"],
+        cwd=PACKAGE,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "test_run_names.py" in done.stdout
+    assert "testpaths = ../test/unit\n" in (PACKAGE / "setup.cfg").read_text()
