@@ -151,6 +151,13 @@ def test_pixels_of_power_are_told_unless_they_are_read_so(recording):
     assert examine(navigation, known).findings == []
 
 
+def test_pixels_of_decibels_are_told_with_their_step(recording):
+    navigation, pings = recording
+    found = examine(navigation, replace(pings, pixels="decibel", db_per_count=0.3789))
+    assert [finding.kind for finding in found.findings] == ["sonar_decibel"]
+    assert found.sonar_changes == {"intensity": "decibel", "db_per_count": 0.38}
+
+
 def test_without_echoes_only_what_needs_none_is_said(recording):
     navigation, pings = recording
     nothing = PingSample(pings.stamp_s, (np.empty((0, 2)),) * len(pings.stamp_s))

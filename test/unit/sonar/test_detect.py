@@ -65,6 +65,33 @@ def test_every_type_and_segmentation_finds_the_wall(rng, dtype, segmentation):
     assert ((found.weight > 0.0) & (found.weight <= 1.0)).all()
 
 
+@pytest.mark.parametrize(("dtype", "step"), [(np.uint8, 0.3), (np.uint16, 0.002)])
+def test_a_logarithm_becomes_the_amplitude_that_it_is_of(rng, dtype, step):
+    amplitude = noisy(rng, np.float32) + 1e-3
+    counts = 20.0 * np.log10(amplitude) / step + np.iinfo(dtype).max
+    logarithm = image(np.round(counts.clip(0, np.iinfo(dtype).max)).astype(dtype))
+    found = detect(logarithm, SonarConfig(intensity="decibel", db_per_count=step))
+    plain = detect(image(amplitude))
+    assert abs(len(found.points) - len(plain.points)) <= 2
+    assert len(plain.points) >= 20
+
+
+def test_a_ring_is_no_wall_and_hides_none(rng):
+    bearings = np.linspace(-1.1, 1.1, 64)
+    plain = image(noisy(rng), bearings=bearings)
+    ringed = plain.intensity.copy()
+    ringed[60:62] = 200
+    found = detect(image(ringed, bearings=bearings))
+    expected = detect(plain)
+    wall = np.abs(np.hypot(*expected.points.T) - 12.1) < 0.2
+    seen = np.abs(np.hypot(*found.points.T) - 12.1) < 0.2
+    assert seen.sum() == wall.sum() == 20
+    assert not (np.abs(np.hypot(*found.points.T) - 6.1) < 0.2).any()
+    # A narrow fan may look at a wall head-on.
+    narrow = detect(image(ringed, bearings=bearings / 3.0))
+    assert (np.abs(np.hypot(*narrow.points.T) - 6.1) < 0.2).sum() > 50
+
+
 def test_memory_order_of_the_image_does_not_matter(rng):
     intensity = noisy(rng)
     for a, b in itertools.pairwise([intensity, np.asfortranarray(intensity), intensity.copy()]):

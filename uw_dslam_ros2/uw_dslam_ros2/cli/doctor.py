@@ -38,6 +38,7 @@ _PIXELS = {
     "compressed": "a root of an echo's amplitude (compressed for display)",
     "amplitude": "an echo's amplitude",
     "power": "an echo's power",
+    "decibel": "the logarithm of an echo",
 }
 _TURNING_CELL_M = 0.25
 """Beams of a sonar that turns lie a degree or two apart: finer cells hold nothing more."""
@@ -64,7 +65,7 @@ class Diagnosis:
     findings: tuple[Finding, ...]
     conventions: Conventions
     num_ping_motions: int
-    sonar_changes: Mapping[str, str]
+    sonar_changes: Mapping[str, str | float]
     pixels: str
     num_turning_windows: int
     is_turning: bool

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
-from uw_dslam_ros2.core.doctor.speckle import patch_variations, quantity_of
+from uw_dslam_ros2.core.doctor.speckle import decibels_per_count, patch_levels, quantity_of
 from uw_dslam_ros2.core.doctor.turning import BeamSample
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
@@ -46,7 +46,7 @@ class SampleCollector:
         self._pings: list[tuple[int, FloatArray]] = []
         self._beams: list[tuple[Beams, SE2, FloatArray | None]] = []
         self._T_base_sonar = SE2()
-        self._variations: list[FloatArray] = []
+        self._levels: list[FloatArray] = []
 
     @property
     def start_ns(self) -> int:
@@ -111,8 +111,8 @@ class SampleCollector:
         """As a mapper's."""
         if is_few_beams(image):
             return self.add_beams(beams_of_image(image), T_base_sonar, projection)
-        if len(self._variations) < _NUM_SPECKLE_IMAGES:
-            self._variations.append(patch_variations(image.intensity))
+        if len(self._levels) < _NUM_SPECKLE_IMAGES:
+            self._levels.append(patch_levels(image.intensity))
         return self._add(detect(image, self._sonar), T_base_sonar, projection)
 
     def add_scan(
@@ -168,8 +168,9 @@ class SampleCollector:
             self.seconds([stamp_ns for stamp_ns, _ in pings]),
             tuple(points for _, points in pings),
             self._T_base_sonar,
-            quantity_of(self._variations),
+            quantity_of(self._levels),
             self._sonar.intensity,
+            decibels_per_count(self._levels),
         )
 
     @property

@@ -23,14 +23,14 @@ class Examination:
     """Whether the sonar turns."""
     mended: set[str] = field(default_factory=set)
     """Kinds of findings that the conventions or the front end's settings mend."""
-    sonar_changes: dict[str, str] = field(default_factory=dict)
+    sonar_changes: dict[str, str | float] = field(default_factory=dict)
     """Settings of the sonar's front end (`SonarConfig`) that mend what was found."""
     has_yaw: bool = True
     has_yaw_rate: bool = True
     is_velocity_judged: bool = False
     """Whether enough motions of the echoes lay within known velocities."""
     pixels: str = ""
-    """What the sonar's images hold: compressed, amplitude or power; "" where it cannot be told."""
+    """What the sonar's images hold: compressed, amplitude, power, decibel; "": not known."""
 
     def add(self, finding: Finding, **changes: str | float | bool) -> None:
         """Name a cause, and what to change."""

@@ -60,6 +60,8 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
     result.has_yaw_rate = bool(np.isfinite(navigation.yaw_rate_rad_s).any())
     if pings.pixels == "power" and pings.pixels_read_as == "amplitude":
         _say_power(result, vehicle_id)
+    if pings.pixels == "decibel" and pings.pixels_read_as != "decibel":
+        _say_decibels(result, pings.db_per_count, vehicle_id)
     if len(navigation.imu_s) < _MIN_READINGS:
         return result
     imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
@@ -84,6 +86,23 @@ def _say_power(result: Examination, vehicle_id: str) -> None:
     )
     result.mended.add("sonar_power")
     result.sonar_changes["intensity"] = "power"
+
+
+def _say_decibels(result: Examination, db_per_count: float, vehicle_id: str) -> None:
+    result.add(
+        Finding(
+            "sonar_decibel",
+            "sonar",
+            "its pixels vary as much where they are dark as where they are bright, as the "
+            "logarithm of an echo does: read as amplitude they show no echo (mapper.sonar."
+            f"intensity: decibel, mapper.sonar.db_per_count: {db_per_count:.2g})",
+            vehicle_id=vehicle_id,
+        )
+    )
+    result.mended.add("sonar_decibel")
+    result.sonar_changes |= {
+        "intensity": "decibel", "db_per_count": float(f"{db_per_count:.2g}"),
+    }  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +304,7 @@ class _Trial:
             "velocity",
             f"its sideways velocity is against the sonar's echoes: its axes are {axes} "
             f"(conventions.velocity_is_mirrored: true, conventions.velocity_yaw_offset_rad: "
-            f"{offset:.2f})",
+            f"{offset:.2f}); or those of the imu and the sonar are, both",
             self._side_confidence,
             velocity_is_mirrored=True,
             velocity_yaw_offset_rad=round(offset, 4) if abs(offset) > _MIN_OFFSET_RAD else 0.0,

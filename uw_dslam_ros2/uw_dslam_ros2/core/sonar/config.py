@@ -27,9 +27,13 @@ class SonarConfig(Config):
     )
     intensity: str = setting(
         "amplitude",
-        choices=("amplitude", "power"),
-        doc="what the image holds: amplitude (Rayleigh noise) or power (exponential noise)",
+        choices=("amplitude", "power", "decibel"),
+        doc="what the image holds: amplitude (Rayleigh noise), power (exponential noise) or "
+        "decibel (a logarithm)",
         is_basic=True,
+    )
+    db_per_count: float = setting(
+        0.3, 1e-4, 1e3, "decibel: what one step of the pixels stands for [dB]"
     )
     fixed_threshold: float = setting(
         0.3, 0.0, 1.0, "fixed: share of full scale (integers: the type's largest value, floats: 1)"

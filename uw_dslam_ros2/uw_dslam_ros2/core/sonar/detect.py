@@ -39,6 +39,9 @@ _NO_ECHO_FREE_SHARE = 0.5
 reflector may have been missed.
 """
 
+_WIDE_FAN_RAD, _RING_SHARE = (1.5, 4.0), 0.6
+"""Of so wide a fan no wall fills so many beams at one range: that is the sea bed's or the
+surface's first echo, or another sonar's ping. A turn may be of a round basin."""
 _MIN_TURN_POINTS, _MAX_TURN_GAP_RAD, _TURN_SPACING_RAD = 30, 0.5 * np.pi, (0.01, 0.1)
 
 
@@ -160,12 +163,16 @@ def image_echoes(image: SonarImage, config: SonarConfig) -> BeamEchoes:
         return BeamEchoes(
             np.empty(0, np.int64), nothing, nothing, np.zeros(len(bearing_rad)), range_sigma_m
         )
-    power = to_power(
-        np.ascontiguousarray(image.intensity), config.intensity == "amplitude", first, last
-    )
+    intensity = image.intensity
+    if config.intensity == "decibel":
+        intensity = _of_decibels(intensity, config.db_per_count)
+    is_amplitude = config.intensity != "power"
+    power = to_power(np.ascontiguousarray(intensity), is_amplitude, first, last)
     if not np.isfinite(power[:, :].sum(dtype=np.float64)):
         raise InvalidInputError("intensity holds values that are not finite")
-    ratio = _threshold_ratio(power, _full_scale(image.intensity.dtype), config)
+    ratio = _threshold_ratio(power, _full_scale(intensity.dtype), config)
+    if _WIDE_FAN_RAD[0] < np.ptp(bearing_rad) < _WIDE_FAN_RAD[1]:
+        ratio[(ratio > 1.0).mean(axis=1) > _RING_SHARE] = 0.0
     gap_bins = config.min_separation_m / bin_m if bin_m > 0.0 else 1.0
     beams, bins, strengths, first_above = select_returns(
         power, ratio, _MODES[config.returns], gap_bins
@@ -281,10 +288,21 @@ def _full_scale(dtype: np.dtype[np.generic]) -> float:
     return float(2**bits - 1) if dtype.kind in "ui" else 1.0
 
 
+def _of_decibels(pixels: NDArray[np.generic], db_per_count: float) -> NDArray[np.float32]:
+    """Amplitudes, of full scale 1; reals have their full scale at 0 dB."""
+    top = _full_scale(pixels.dtype) if pixels.dtype.kind in "ui" else 0.0
+    if pixels.dtype.kind == "u" and pixels.dtype.itemsize <= 2:
+        counts = np.arange(top + 1.0)
+        table = np.asarray(10.0 ** ((counts - top) * db_per_count / 20.0), np.float32)
+        return table[pixels.astype(np.intp)]
+    values = np.asarray(pixels, np.float32)
+    return np.asarray(10.0 ** ((values - top) * np.float32(db_per_count / 20.0)), np.float32)
+
+
 def _threshold_ratio(
     power: NDArray[np.float32], full_scale: float, config: SonarConfig
 ) -> NDArray[np.float32]:
-    exponent = 2 if config.intensity == "amplitude" else 1
+    exponent = 1 if config.intensity == "power" else 2
     floor = (config.min_threshold * full_scale) ** exponent
     if config.segmentation == "fixed":
         threshold = max((config.fixed_threshold * full_scale) ** exponent, 1e-30)
