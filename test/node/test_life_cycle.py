@@ -1,5 +1,8 @@
 """The life cycle of the nodes, and which parameters may change in which of its states."""
 
+import threading
+import time
+
 import pytest
 
 pytest.importorskip("rclpy")
@@ -10,16 +13,20 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from node.drives import Vehicle, drive, finish, mapper_of
 from places import room_map, room_submap
 from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
+from uw_dslam_msgs.action import RegisterMaps as RegisterMapsAction
 from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_msgs.srv import RegisterMaps
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError
+from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.io.session import load_session
 from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg, submap_to_msg
+from uw_dslam_ros2.ros.nodes import registration_server
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
 from uw_dslam_ros2.ros.nodes.sonar_mapper import SonarMapper
@@ -30,7 +37,7 @@ pytestmark = pytest.mark.ros
 NODES = {
     "sonar_mapper": (SonarMapper, "path", "map_period_s", "mapper.submap.max_length_m"),
     "registration_server": (
-        *(RegistrationServer, "register_maps/_action/feedback"),
+        *(RegistrationServer, "/diagnostics"),
         *("registration.max_false_accept", "max_parallel"),
     ),
     "map_queue_manager": (MapQueueManager, "pose_graph", "publish_period_s", "queue.max_partners"),
@@ -78,7 +85,7 @@ class Hand:
 def test_a_node_goes_through_its_states_when_told(ros_context, spinning, name):
     node_type, topic, _, fixed = NODES[name]
     node, hand = make(node_type, ros_context, autostart=False), Hand(ros_context, name)
-    topic = f"/auv_1/{topic}" if name != "registration_server" else f"/auv_1/{name}/{topic}"
+    topic = topic if topic.startswith("/") else f"/auv_1/{topic}"
 
     def is_published():
         return hand.node.count_publishers(topic) > 0
@@ -145,6 +152,44 @@ def test_a_server_that_is_not_active_says_that_it_is_busy(ros_context, spinning)
         assert hand.change(until, Transition.TRANSITION_ACTIVATE)
         response = hand.call(until, RegisterMaps, "register_maps", source=room, target=room)
         assert response.result == response.DONE
+
+
+def test_who_waits_for_a_server_that_is_cleaned_up_gets_an_answer(
+    ros_context, spinning, monkeypatch
+):
+    begun = threading.Event()
+
+    def endless(*_, progress, is_cancelled, **__):  # noqa: ARG001
+        begun.set()
+        while not is_cancelled():
+            time.sleep(0.01)
+        return RegistrationResult.refused(Verdict.BUDGET_EXHAUSTED, "cancelled")
+
+    monkeypatch.setattr(registration_server, "register_grids", endless)
+    server, hand = make(RegistrationServer, ros_context), Hand(ros_context, "registration_server")
+    room = occupancy_to_msg(room_map(), "somewhere", 0)
+    name = "/auv_1/registration_server/register_maps"
+    asking = hand.node.create_client(RegisterMaps, name)
+    acting = ActionClient(hand.node, RegisterMapsAction, name)
+    with spinning(server, hand.node) as until:
+        until(asking.service_is_ready, "the service")
+        until(acting.server_is_ready, "the action")
+        answer = asking.call_async(RegisterMaps.Request(source=room, target=room))
+        until(begun.is_set, "the search")
+        goal = acting.send_goal_async(RegisterMapsAction.Goal(source=room, target=room))
+        until(goal.done, "the goal")
+        result = goal.result().get_result_async()
+        assert hand.change(until, Transition.TRANSITION_DEACTIVATE)
+        assert hand.change(until, Transition.TRANSITION_CLEANUP)
+        until(answer.done, "the answer")
+        assert answer.result().registration.reason == "cancelled"
+        until(result.done, "the action's result")
+        assert hand.change(until, Transition.TRANSITION_CONFIGURE)
+        assert hand.change(until, Transition.TRANSITION_ACTIVATE)
+        goal = acting.send_goal_async(RegisterMapsAction.Goal(source=room, target=room))
+        until(goal.done, "a goal again")
+        assert goal.result().accepted
+    acting.destroy()
 
 
 def test_a_manager_that_rests_takes_nothing_and_then_gets_what_it_missed(

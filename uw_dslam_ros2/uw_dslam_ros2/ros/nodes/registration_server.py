@@ -63,6 +63,7 @@ class RegistrationServer(ManagedNode):
     )
     live = frozenset({"max_cells", "max_points", "registration.*", "points.*"})
     why_fixed = "its threads are started with it"
+    _action: ActionServer | None = None
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("registration_server", **kwargs)
@@ -82,7 +83,15 @@ class RegistrationServer(ManagedNode):
             self.create_service(
                 service_type, name, serve, qos_profile=SERVICES, callback_group=group
             )
-        self._action = ActionServer(
+        if self._action is None:
+            self._action = self._make_action(group)
+        # New with every start: whoever waits for an answer sees that its server is gone.
+        instance = f"{socket.gethostname()}:{os.getpid()}:{time.time_ns()}"
+        self.tell_health(self._report, instance)
+
+    def _make_action(self, group: ReentrantCallbackGroup) -> ActionServer:
+        """Once: an executor that waits for goals does not survive the end of their server."""
+        return ActionServer(
             self,
             RegisterMapsAction,
             "~/register_maps",
@@ -94,10 +103,13 @@ class RegistrationServer(ManagedNode):
             result_service_qos_profile=SERVICES,
             cancel_service_qos_profile=SERVICES,
         )
-        self.at_end(self._action.destroy)
-        # New with every start: whoever waits for an answer sees that its server is gone.
-        instance = f"{socket.gethostname()}:{os.getpid()}:{time.time_ns()}"
-        self.tell_health(self._report, instance)
+
+    def destroy_node(self) -> None:
+        """Stop, then destroy."""
+        self.stop()
+        if self._action is not None:
+            self._action.destroy()
+        super().destroy_node()
 
     def begin(self) -> None:
         """Take requests."""

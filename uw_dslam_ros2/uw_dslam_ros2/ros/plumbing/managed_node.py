@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
@@ -10,6 +12,7 @@ from typing import Any, ClassVar
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.service import Service
 
 from uw_dslam_ros2.core.config import Config
 from uw_dslam_ros2.core.errors import ConfigError, UwDslamError
@@ -26,6 +29,8 @@ __all__ = ["ManagedNode"]
 
 _ENTITIES = ("publisher", "subscription", "client", "service", "timer")
 _WOKEN_BY = ("subscription", "timer")
+_ANSWERS_S, _SENT_S = 5.0, 0.1
+"""Longest wait for callbacks that answer a request, and until their answers are sent."""
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -54,6 +59,7 @@ class ManagedNode(QosOverrides, LifecycleNode):
     """Why the others may not, as the end of a sentence."""
 
     def __init__(self, name: str, **kwargs: Any) -> None:
+        self._answering, self._num_answering = threading.Condition(), 0
         super().__init__(name, **kwargs)
         self._settings: dict[str, Config] = {
             prefix: declare_config(self, config_type, prefix, is_read_only=False)
@@ -184,6 +190,7 @@ class ManagedNode(QosOverrides, LifecycleNode):
     def _unmake(self) -> None:
         self._deactivate()
         self.stop()
+        self._wait_for_answers()
         self._destroy(self._entities() - self._before)
 
     def _try(self, act: Callable[[], None], mend: Callable[[], None]) -> TransitionCallbackReturn:
@@ -208,6 +215,28 @@ class ManagedNode(QosOverrides, LifecycleNode):
         """Stop, then destroy."""
         self.stop()
         super().destroy_node()
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Any, **kwargs: Any
+    ) -> Service:
+        """As the base class; it is not destroyed under a request that is being answered."""
+
+        def answer(request: Any, response: Any) -> Any:
+            with self._answering:
+                self._num_answering += 1
+            try:
+                return callback(request, response)
+            finally:
+                with self._answering:
+                    self._num_answering -= 1
+                    self._answering.notify_all()
+
+        return super().create_service(srv_type, srv_name, answer, **kwargs)
+
+    def _wait_for_answers(self) -> None:
+        with self._answering:
+            self._answering.wait_for(lambda: self._num_answering == 0, _ANSWERS_S)
+        time.sleep(_SENT_S)
 
     def _entities(self, kinds: Sequence[str] = _ENTITIES) -> set[Any]:
         return {entity for kind in kinds for entity in getattr(self, f"{kind}s")}
