@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ __all__ = [
     "decode_walls",
     "encode_cells",
     "encode_walls",
+    "near_walls",
 ]
 
 CellArray = NDArray[np.int8]
@@ -37,6 +39,7 @@ _SIZES = tuple(3**n for n in (3, 5, 7, 10, 7, 8, 6, 7, 9))
 _STARTS = tuple(sum(_SIZES[:k]) for k in range(len(_SIZES) + 1))
 _NUM_MODELS = len(_SIZES)
 _NUM_SURE = 6  # a model's weight depends on how often it has seen the context
+_FRAME = 3
 _MAX_COUNT = 60
 _FIRST_WEIGHT = 3 * 65536 // 10
 _LEARNING_SHIFT = 14
@@ -70,8 +73,14 @@ def decode_cells(data: bytes, coarse: CellArray) -> CellArray:
     return _decoded(data, coarse, 2)
 
 
+def near_walls(coarse: CellArray) -> NDArray[np.bool_]:
+    """Which cells (R, C) are at most two from a wall that is known: only there may new ones be."""
+    walls = (coarse == CELL_WALL).astype(np.uint8)
+    return cv2.dilate(walls, np.ones((5, 5), np.uint8)) > 0
+
+
 def encode_walls(walls: NDArray[np.bool_], coarse: CellArray) -> bytes:
-    """Encode which cells (R, C) are walls; `coarse` as for `encode_cells`."""
+    """Encode which cells (R, C) are walls, where `near_walls`; `coarse` as for `encode_cells`."""
     return _encoded(walls.astype(np.int8), coarse, 1)
 
 
@@ -84,7 +93,7 @@ def _encoded(cells: CellArray, coarse: CellArray, num_bits: int) -> bytes:
     buffer = np.zeros(4 * cells.size + 16, np.uint8)  # no bit costs more than 16
     _check(cells, coarse)
     num_bytes = _code(
-        np.array(cells, np.int8), np.ascontiguousarray(coarse), buffer, False, num_bits, *_tables()
+        _framed(cells), *_known(coarse, num_bits), buffer, False, num_bits, *_tables()
     )
     return bytes(buffer[:num_bytes]).rstrip(b"\0")
 
@@ -92,15 +101,22 @@ def _encoded(cells: CellArray, coarse: CellArray, num_bits: int) -> bytes:
 def _decoded(data: bytes, coarse: CellArray, num_bits: int) -> CellArray:
     cells = np.zeros(coarse.shape, np.int8)
     _check(cells, coarse)
-    _code(
-        cells,
-        np.ascontiguousarray(coarse),
-        np.frombuffer(bytearray(data), np.uint8),
-        True,
-        num_bits,
-        *_tables(),
-    )
-    return cells
+    framed, buffer = _framed(cells), np.frombuffer(bytearray(data), np.uint8)
+    _code(framed, *_known(coarse, num_bits), buffer, True, num_bits, *_tables())
+    return np.ascontiguousarray(framed[_FRAME:-_FRAME, _FRAME:-_FRAME])
+
+
+def _known(coarse: CellArray, num_bits: int) -> tuple[CellArray, CellArray]:
+    """What is known of each cell, and whether more is to be told of it."""
+    is_open = np.ones_like(coarse) if num_bits > 1 else near_walls(coarse).astype(np.int8)
+    return _framed(coarse), _framed(is_open)
+
+
+def _framed(cells: CellArray) -> CellArray:
+    """With unknown cells around, as far as a neighbourhood reaches."""
+    framed = np.zeros((cells.shape[0] + 2 * _FRAME, cells.shape[1] + 2 * _FRAME), np.int8)
+    framed[_FRAME:-_FRAME, _FRAME:-_FRAME] = cells
+    return framed
 
 
 def _check(cells: CellArray, coarse: CellArray) -> None:
@@ -112,36 +128,28 @@ def _check(cells: CellArray, coarse: CellArray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _at(cells, row, col):  # type: ignore[no-untyped-def]
-    """A cell; outside nothing is known."""
-    if row < 0 or col < 0 or row >= cells.shape[0] or col >= cells.shape[1]:
-        return 0
-    return int(cells[row, col])
-
-
-@njit(cache=True, nogil=True)
 def _contexts(cells, coarse, row, col, found):  # type: ignore[no-untyped-def]
     """Number the neighbourhoods of a cell, of cells that came before it and of coarse ones.
 
     Where all neighbours are alike, as most are, returns the number of that case and no more; else
     -1.
     """
-    w, n = _at(cells, row, col - 1), _at(cells, row - 1, col)
-    nw, ne = _at(cells, row - 1, col - 1), _at(cells, row - 1, col + 1)
-    ww, nn = _at(cells, row, col - 2), _at(cells, row - 2, col)
-    nww, nee = _at(cells, row - 1, col - 2), _at(cells, row - 1, col + 2)
-    here = _at(coarse, row, col)
-    east, south = _at(coarse, row, col + 1), _at(coarse, row + 1, col)
-    west, north = _at(coarse, row, col - 1), _at(coarse, row - 1, col)
-    south_east, south_west = _at(coarse, row + 1, col + 1), _at(coarse, row + 1, col - 1)
+    w, n = int(cells[row, col - 1]), int(cells[row - 1, col])
+    nw, ne = int(cells[row - 1, col - 1]), int(cells[row - 1, col + 1])
+    ww, nn = int(cells[row, col - 2]), int(cells[row - 2, col])
+    nww, nee = int(cells[row - 1, col - 2]), int(cells[row - 1, col + 2])
+    here = int(coarse[row, col])
+    east, south = int(coarse[row, col + 1]), int(coarse[row + 1, col])
+    west, north = int(coarse[row, col - 1]), int(coarse[row - 1, col])
+    south_east, south_west = int(coarse[row + 1, col + 1]), int(coarse[row + 1, col - 1])
     if w == n == nw == ne == ww == nn == nww == nee and (
         here == east == south == west == north == south_east == south_west
     ):
         return 3 * w + here
-    www, nnn = _at(cells, row, col - 3), _at(cells, row - 3, col)
-    nnw, nne = _at(cells, row - 2, col - 1), _at(cells, row - 2, col + 1)
-    neee = _at(cells, row - 1, col + 3)
-    east_2, south_2 = _at(coarse, row, col + 2), _at(coarse, row + 2, col)
+    www, nnn = int(cells[row, col - 3]), int(cells[row - 3, col])
+    nnw, nne = int(cells[row - 2, col - 1]), int(cells[row - 2, col + 1])
+    neee = int(cells[row - 1, col + 3])
+    east_2, south_2 = int(coarse[row, col + 2]), int(coarse[row + 2, col])
     near = ((w * 3 + n) * 3 + nw) * 3 + ne
     wide = (near * 3 + ww) * 3 + nn
     found[0] = (w * 3 + n) * 3 + here
@@ -170,9 +178,9 @@ def _learn(probabilities, counts, place, bit, rate):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True)
 def _code(  # type: ignore[no-untyped-def]
-    cells, coarse, buffer, is_decoding, num_bits, starts, stretch, squash, rate
+    cells, coarse, is_open, buffer, is_decoding, num_bits, starts, stretch, squash, rate
 ):  # fmt: skip
-    """Encode cells (R, C) into the buffer, or decode them from it; returns the bytes used.
+    """Encode framed cells into the buffer, or decode them from it; returns the bytes used.
 
     Each takes up to `num_bits` bits: whether it is more than 0, then whether it is more than 1.
     """
@@ -192,8 +200,10 @@ def _code(  # type: ignore[no-untyped-def]
         for _ in range(4):
             code = (code << 8) | (buffer[place] if place < buffer.shape[0] else 0)
             place += 1
-    for row in range(cells.shape[0]):
-        for col in range(cells.shape[1]):
+    for row in range(_FRAME, cells.shape[0] - _FRAME):
+        for col in range(_FRAME, cells.shape[1] - _FRAME):
+            if is_open[row, col] == 0:
+                continue
             alike = _contexts(cells, coarse, row, col, context)
             value = int(cells[row, col])
             decoded = 0

@@ -41,42 +41,41 @@ def levelled(occupancy: OccupancyMap, unit_m: float) -> OccupancyMap:
 
 
 @njit(cache=True, nogil=True)
-def count_blocks(values, size, side, free_max, wall_min):  # type: ignore[no-untyped-def]
-    """Walls and free cells (2, R, C) of a map [percent] in blocks of ``size`` x ``size`` cells.
-
-    R and C are multiples of `side`; what lies beyond the map is unknown.
-    """
-    rows = -(-values.shape[0] // (size * side)) * side
-    cols = -(-values.shape[1] // (size * side)) * side
-    counts = np.zeros((2, rows, cols), np.int32)
+def _blocks(values, width, rows, cols, free_max, wall_min):  # type: ignore[no-untyped-def]
+    """Cells (rows, cols) of blocks of ``width`` x ``width`` of a map's cells [percent]."""
+    walls, free = np.zeros((rows, cols), np.int32), np.zeros((rows, cols), np.int32)
     for row in range(values.shape[0]):
-        for col in range(values.shape[1]):
-            value = values[row, col]
-            if value >= wall_min:
-                counts[0, row // size, col // size] += 1
-            elif 0 <= value <= free_max:
-                counts[1, row // size, col // size] += 1
-    return counts
+        block_row = row // width
+        for block_col in range(-(-values.shape[1] // width)):
+            num_walls, num_free = 0, 0
+            for col in range(block_col * width, min(values.shape[1], (block_col + 1) * width)):
+                value = values[row, col]
+                if value >= wall_min:
+                    num_walls += 1
+                elif 0 <= value <= free_max:
+                    num_free += 1
+            walls[block_row, block_col] += num_walls
+            free[block_row, block_col] += num_free
+    cells = np.zeros((rows, cols), np.int8)
+    for row in range(rows):
+        for col in range(cols):
+            if walls[row, col] >= max(1, (width + 1) // 2):
+                cells[row, col] = CELL_WALL
+            elif 3 * free[row, col] >= width * width:
+                cells[row, col] = CELL_FREE
+    return cells
 
 
-def reduce_cells(values: NDArray[np.int8], size: int) -> dict[int, CellArray]:
-    """Cells of three values, one, two and three blocks of ``size`` x ``size`` a side, by that.
+def reduce_cells(values: NDArray[np.int8], size: int, factor: int) -> CellArray:
+    """Cells of three values, `factor` blocks of ``size`` x ``size`` a side.
 
     A cell is a wall if half of a line through it is, else free if a third of it is, else unknown;
-    see `drop_specks` for the rest. All begin at the map's first cell and reach equally far.
+    see `drop_specks` for the rest. For all of the factors 1, 2 and 3 they begin at the map's first
+    cell and reach equally far.
     """
-    counts = count_blocks(values, size, 6, _FREE_MAX_PERCENT, _WALL_MIN_PERCENT)
-    found = {}
-    for factor in (1, 2, 3):
-        _, rows, cols = counts.shape
-        blocks = counts.reshape(2, rows // factor, factor, cols // factor, factor)
-        num_walls, num_free = blocks.sum(axis=(2, 4))
-        cells = np.zeros(num_free.shape, np.int8)
-        width = factor * size
-        cells[3 * num_free >= width * width] = CELL_FREE
-        cells[num_walls >= max(1, (width + 1) // 2)] = CELL_WALL
-        found[factor] = drop_specks(cells)
-    return found
+    rows, cols = (-(-length // (6 * size)) * (6 // factor) for length in values.shape)
+    cells = _blocks(values, factor * size, rows, cols, _FREE_MAX_PERCENT, _WALL_MIN_PERCENT)
+    return drop_specks(cells)
 
 
 def drop_specks(cells: CellArray) -> CellArray:
@@ -107,13 +106,9 @@ def known_window(cells: CellArray) -> tuple[slice, slice]:
 def spread(
     coarse: CellArray, coarse_factor: int, shape: tuple[int, int], factor: int
 ) -> CellArray:
-    """For each cell of a finer grid from the same corner, the coarse cell under its middle."""
+    """For each cell of a finer grid of the same area, the coarse cell under its middle."""
     rows, cols = (((2 * np.arange(n) + 1) * factor) // (2 * coarse_factor) for n in shape)
-    wide = np.zeros((shape[0], shape[1]), np.int8)
-    inside = np.ix_(rows < coarse.shape[0], cols < coarse.shape[1])
-    picked = coarse[np.ix_(rows[rows < coarse.shape[0]], cols[cols < coarse.shape[1]])]
-    wide[inside] = picked
-    return wide
+    return coarse.take(rows, axis=0).take(cols, axis=1)
 
 
 def with_walls(known: CellArray, walls: NDArray[np.bool_]) -> CellArray:

@@ -21,6 +21,7 @@ from uw_dslam_ros2.core.link.coding.cell_coder import (
     decode_walls,
     encode_cells,
     encode_walls,
+    near_walls,
 )
 from uw_dslam_ros2.core.link.coding.cells import (
     known_window,
@@ -181,7 +182,7 @@ def encode_submap(
     own_units = round(occupancy.spec.resolution_m / _UNIT_M)
     small = max(1, round(_SMALL_UNITS / own_units))
     corner = tuple(round(v / _CORNER_M) for v in occupancy.spec.T_frame_grid.as_array()[:2])
-    reduced, (row, col) = _reduced(occupancy.values, small)
+    reduced, (row, col) = _reduced(occupancy.values, small, finest)
     unit = own_units * small
     corner = (corner[0] + col * unit // 10, corner[1] + row * unit // 10)
     coarse_data, coarse = _write_coarse(submap, unit, corner, reduced[Layer.COARSE], key)
@@ -247,15 +248,19 @@ def _head(data: bytes) -> tuple[Layer, ByteReader]:
 
 
 def _reduced(
-    values: NDArray[np.int8], small: int
+    values: NDArray[np.int8], small: int, finest: Layer
 ) -> tuple[dict[Layer, CellArray], tuple[int, int]]:
-    """Cells of each layer, cut to the window that is known, and its first row and column.
+    """Cells of each layer down to `finest`, cut to what is known, and its first row and column.
 
-    The window begins and ends on corners that the cells of all layers share; first row and column
-    are counted in cells of the finest layer.
+    The window begins and ends on corners that the cells of all layers share; first row and
+    column are counted in cells of the finest layer.
     """
-    reduced = reduce_cells(np.ascontiguousarray(values), small)
-    cells = {Layer(number): reduced[factor] for number, factor in _FACTORS.items()}
+    values = np.ascontiguousarray(values)
+    cells = {
+        Layer(number): reduce_cells(values, small, factor)
+        for number, factor in _FACTORS.items()
+        if number <= finest
+    }
     rows, cols = known_window(cells[Layer.COARSE])
     first = rows.start // 2 * 2, cols.start // 2 * 2
     last = -(-rows.stop // 2) * 2, -(-cols.stop // 2) * 2
@@ -266,10 +271,10 @@ def _reduced(
             3 * edge // _FACTORS[layer] for edge in (first[0], last[0], first[1], last[1])
         )
         cut[layer] = np.ascontiguousarray(whole[row_0:row_1, col_0:col_1])
-    if max(cut[Layer.FINE].shape) > _MAX_SIDE:
+    fine = tuple(_FACTORS[Layer.COARSE] * side for side in cut[Layer.COARSE].shape)
+    if max(fine) > _MAX_SIDE:
         raise InvalidInputError(
-            f"the submap is {cut[Layer.FINE].shape} cells of the finest layer, expected at most "
-            f"{_MAX_SIDE} a side"
+            f"the submap is {fine} cells of the finest layer, expected at most {_MAX_SIDE} a side"
         )
     return cut, (3 * first[0], 3 * first[1])
 
@@ -343,7 +348,7 @@ def _write_finer(
     below: CellLayer, layer: Layer, cells: CellArray, key: bytes
 ) -> tuple[bytes, CellLayer]:
     known = spread(below.cells, _FACTORS[below.layer], cells.shape, _FACTORS[layer])
-    walls = cells == CELL_WALL
+    walls = (cells == CELL_WALL) & near_walls(known)
     found = _refined(below, layer, with_walls(known, walls), key)
     writer = _begun(layer)
     writer.raw(found.tag + encode_walls(walls, known))

@@ -21,7 +21,7 @@ NUM_BINS = 20
 """Bins of the distances between walls."""
 _DIRECTIONS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]])
 _REACH_STEP_M = 0.5
-_MAX_WALLS = 400
+_MAX_WALLS = 200
 _TAG_BYTES = 4
 
 

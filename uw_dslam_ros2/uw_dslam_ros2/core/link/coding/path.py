@@ -91,9 +91,12 @@ def read_path(reader: ByteReader) -> tuple[IntArray, FloatArray]:
 
 def _knots(tenths: FloatArray, poses: FloatArray, rows: IntArray) -> list[int]:
     chosen = sorted({0, len(poses) - 1})
+    group = np.unique(rows[:, 0], return_inverse=True)[1]
+    is_knot = np.zeros(len(poses), bool)  # of groups of equal time
     for _ in range(_MOST_KNOTS - 2):
         off = (np.abs(_curve(tenths, rows[chosen]) - poses) / _TOLERANCES).max(axis=1)
-        off[np.isin(rows[:, 0], rows[chosen, 0])] = 0.0
+        is_knot[group[chosen]] = True
+        off[is_knot[group]] = 0.0
         worst = int(np.argmax(off))
         if off[worst] <= 1.0:
             break
