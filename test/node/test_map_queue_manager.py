@@ -491,14 +491,20 @@ def test_what_is_set_aside_is_told(manage):
         statuses.extend(s for s in msg.status if s.name.startswith("map_queue_manager"))
 
     far = SE2(5000.0, 0.0)
+
+    def of_run(*args, **kwargs):
+        return dataclasses.replace(room_submap("auv_1", *args, **kwargs), run_id=1936390121)
+
     with manage(**FAST) as (until, probe, _):
         probe.node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
-        probe.send(room_submap("auv_1"))
-        probe.send(room_submap("auv_1", sequence=1, T_odom_submap=far))
+        probe.send(of_run())
+        until(lambda: probe.num_merged, "the first submap")
+        assert probe.statuses[-1].message == "auv_1/0 revision 0 received", "not by its number"
+        probe.send(of_run(sequence=1, T_odom_submap=far))
         until(lambda: SubmapInfo.SET_ASIDE in probe.states().values(), "the leap")
         until(lambda: statuses and "auv_1: set aside: odometry" in statuses[-1].message, "a word")
         assert statuses[-1].level == DiagnosticStatus.WARN
-        probe.send(room_submap("auv_1", sequence=1, revision=1))
+        probe.send(of_run(sequence=1, revision=1))
         until(lambda: SubmapInfo.SET_ASIDE not in probe.states().values(), "its return")
         until(lambda: "set aside" not in statuses[-1].message, "no more word of it")
 

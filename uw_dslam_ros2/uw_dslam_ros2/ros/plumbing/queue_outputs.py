@@ -18,8 +18,8 @@ from uw_dslam_ros2.core.merging import (
     SubmapRecord,
     SubmapState,
 )
+from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Track, track_name
 from uw_dslam_ros2.ros.convert.graph_markers import graph_to_markers
 from uw_dslam_ros2.ros.convert.merging import (
     constraint_to_msg,
@@ -45,13 +45,14 @@ class StatusPublisher:
         self._graph_pub = node.create_publisher(MarkerArray, "pose_graph", LATCHED)
         self.values: Values = {}
         """Of the last status, for the diagnostics."""
-        self._aside: dict[Track, str] = {}
+        self._aside: dict[str, str] = {}
 
     def publish(self, queue: MapQueue, num_in_flight: int, num_servers: int, message: str) -> None:
         """Tell how it stands."""
         stamp = self._node.get_clock().now().to_msg()
         records, constraints = queue.submaps(), queue.constraints()
         states = Counter(record.state for record in records)
+        names = RunNames(record.submap for record in records)
         msg = MergeStatus(
             submaps=[record_to_msg(record) for record in records],
             constraints=[constraint_to_msg(constraint) for constraint in constraints],
@@ -64,7 +65,7 @@ class StatusPublisher:
             num_in_flight=num_in_flight,
             num_servers=num_servers,
             num_decisions=queue.num_decisions,
-            message=message,
+            message=names.in_text(message),
         )
         msg.header.stamp = stamp
         msg.header.frame_id = self._map_frame
@@ -72,7 +73,7 @@ class StatusPublisher:
         decided = [record.decision for record in queue.decisions() if record.is_in_force]
         markers = graph_to_markers(records, constraints, self._map_frame, stamp, decided)
         self._graph_pub.publish(markers)
-        self._tell_aside(records)
+        self._tell_aside(records, names)
         self.values = {name: getattr(msg, name) for name in _COUNTS}
         self.values |= {"num_in_flight": num_in_flight, "num_servers": num_servers}
         self.values["num_submaps"] = len(records)
@@ -82,19 +83,20 @@ class StatusPublisher:
     @property
     def aside(self) -> str:
         """Who is set aside, and why; empty: nobody is."""
-        return "; ".join(f"{track_name(track)}: {why}" for track, why in self._aside.items())
+        return "; ".join(f"{run}: {why}" for run, why in self._aside.items())
 
-    def _tell_aside(self, records: Sequence[SubmapRecord]) -> None:
+    def _tell_aside(self, records: Sequence[SubmapRecord], names: RunNames) -> None:
         """Say so when a run, or a part of it, is set aside, and when it is back."""
-        aside: dict[Track, str] = {}
+        aside: dict[str, str] = {}
         for record in records:
             if record.state is SubmapState.SET_ASIDE:
-                aside.setdefault(record.submap.submap_id.track, record.reason)
+                run = names.track(record.submap.submap_id.track)
+                aside.setdefault(run, names.in_text(record.reason))
         logger = self._node.get_logger()
-        for track in aside.keys() - self._aside.keys():
-            logger.warning(f"{track_name(track)}: {aside[track]}")
-        for track in self._aside.keys() - aside.keys():
-            logger.info(f"{track_name(track)} is not set aside any more")
+        for run in aside.keys() - self._aside.keys():
+            logger.warning(f"{run}: {aside[run]}")
+        for run in self._aside.keys() - aside.keys():
+            logger.info(f"{run} is not set aside any more")
         self._aside = aside
 
 
