@@ -1,6 +1,7 @@
 """The study command: every study is offered, and what it writes can be read."""
 
 import csv
+import math
 import os
 from itertools import pairwise
 
@@ -10,13 +11,15 @@ import pytest
 from uw_dslam_ros2.cli.studies import _verdict_trials, field, sigma
 from uw_dslam_ros2.cli.studies._ceiling import best_with_known_noise
 from uw_dslam_ros2.cli.studies._common import is_success
+from uw_dslam_ros2.cli.studies._pair_list import PAIR_COLUMNS, read_pairs
 from uw_dslam_ros2.cli.studies._trials import Cell
 from uw_dslam_ros2.cli.study import build_parser, main, study_names
+from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.sim.floor_plans import make_place
-from uw_dslam_ros2.sim.map_pairs import observe
+from uw_dslam_ros2.sim.map_pairs import make_pair, observe
 
 
 def test_every_study_has_help(capsys):
@@ -140,6 +143,32 @@ def test_verdict_prints_models_that_can_be_pasted(tmp_path, capsys, monkeypatch)
         clean = [r for r in rows if r["noise"] == "clean" and r["is_matching"] == "True"]
         assert {row["is_right"] for row in clean} == {"True"}
         assert {r["is_right"] for r in rows if r["is_matching"] == "False"} == {"False"}
+
+
+def test_verdict_reads_real_pairs_from_a_list(tmp_path):
+    pair = make_pair("harbour", 0.7, "clean", 1, size_cells=60)
+    for name, occupancy in (("one", pair.source), ("other", pair.target)):
+        write_map(tmp_path / name, occupancy)
+    T, path = pair.T_target_source, tmp_path / "pairs.csv"
+    lines = [
+        ",".join(PAIR_COLUMNS),
+        f"one.yaml,other.yaml,here,{T.x},{T.y},{math.degrees(T.yaw)},1",
+        "one.yaml,one.yaml,here there,,,,",
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    own, different = read_pairs(path)
+    assert own.pair.T_target_source.as_array() == pytest.approx(T.as_array())
+    assert own.is_like_its_mirror
+    assert not different.is_like_its_mirror
+    assert different.pair.T_target_source is None
+    assert [task.has_mirror for task in _verdict_trials.listed_tasks(path)] == [False, True]
+    for wrong, said in (
+        (lines[0].replace("yaw_deg", "yaw"), "no column yaw_deg"),
+        (f"{lines[0]}\n{lines[2].replace(',,,', ',1,,')}", "line 2: the motion is"),
+    ):
+        path.write_text(wrong + "\n")
+        with pytest.raises(DataError, match=said):
+            list(read_pairs(path))
 
 
 def test_overlap_counts_what_it_accepts(tmp_path, capsys, monkeypatch):

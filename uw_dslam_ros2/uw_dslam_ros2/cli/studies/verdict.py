@@ -1,25 +1,30 @@
 """Fit the probability of a map match on some places, and judge it on others.
 
-Evidence of simulated pairs is gathered without the proof: windows of one map, of different places,
-of symmetric ones, of the two like ends of one basin, and maps that were built apart, as in `study
-apart`; half of the pairs once more with a prior window of random size. Two small logistic models
-are fitted: whether a pose is right, from what speaks for it by itself, on all refined poses; and
-whether the best pose is right, in view of its strongest rival. The first model also says which
-pose is the best, so after it has changed much the evidence has to be gathered once more for the
-second to be that of its choices. The models are judged on other seeds and on kinds of places that
-the fit never saw. The coefficients that this command prints are those of
-`uw_dslam_ros2.core.registration.grids.judging.probability.MODELS`.
+Evidence of pairs is gathered without the proof: windows of one map, of different places, of
+symmetric ones, of the two like ends of one basin; maps that were built apart, as in `study apart`;
+and real maps of a list (`--pairs`), with motions that somebody has checked. Half of the pairs come
+once more with a prior window of random size, and those of one place once more in a mirror, where
+nothing is right. Two small logistic models are fitted: whether a pose is right, from what speaks
+for it by itself, on all refined poses; and whether the best pose is right, in view of the others.
+The first model also says which pose is the best, so after it has changed much the evidence has to
+be gathered once more for the second to be that of its choices. The models are judged on other
+seeds, on kinds of places and on lists that the fit never saw. The coefficients that this command
+prints are those to put into `MODELS` of
+`uw_dslam_ros2.core.registration.grids.judging.probability`, which says what they were fitted on.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.linear_model import LogisticRegression
+from scipy.optimize import minimize
+from scipy.special import expit
 
 from uw_dslam_ros2.cli.studies._apart_maps import apart_maps
 from uw_dslam_ros2.cli.studies._common import (
@@ -28,7 +33,15 @@ from uw_dslam_ros2.cli.studies._common import (
     save_figure,
     share_interval,
 )
-from uw_dslam_ros2.cli.studies._verdict_trials import Trial, apart_tasks, gathered, window_tasks
+from uw_dslam_ros2.cli.studies._pair_list import PAIR_COLUMNS
+from uw_dslam_ros2.cli.studies._verdict_trials import (
+    Trial,
+    apart_tasks,
+    gathered,
+    listed_tasks,
+    weights_of,
+    window_tasks,
+)
 from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MATCH_FEATURES,
     POSE_FEATURES,
@@ -49,6 +62,9 @@ _CHECK_KINDS = ("oblique", "cellular", "cave", "corridors", "harbour", "symmetri
 _OVERLAPS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _FIRST_CHECK = 1000
 _RIDGE = 1.0
+# Slopes of windows with and without priors, and of places that look like themselves: held where
+# few pairs are of such.
+_HELD_SLOPES = {"log_volume": -0.2288, "rival": -1.1911}
 _OTHER_WEIGHT = 0.3  # of poses beside that of the highest score: there are several in each pair
 _APART_BINS = (0.05, 0.2, 0.4, 0.5, 1.01)
 _NUM_VEHICLES = 4  # maps of each place
@@ -73,14 +89,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cache", type=Path, metavar="DIR", help="folder of maps built apart (default: in --out)"
     )
+    parser.add_argument(
+        "--pairs", type=Path, metavar="CSV",
+        help=f"real pairs to fit on, too; columns {', '.join(PAIR_COLUMNS)}",
+    )  # fmt: skip
+    parser.add_argument(
+        "--check-pairs", type=Path, metavar="CSV", help="real pairs of other places, to judge on"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Gather, fit, check, draw."""
-    fit = _gathered(args, "fit", args.fit_kinds, range(args.seeds), args.places)
+    fit = _gathered(args, "fit", args.fit_kinds, range(args.seeds), args.places, args.pairs)
     models = _fitted(fit)
     seeds = range(_FIRST_CHECK, _FIRST_CHECK + args.checks)
-    check = _gathered(args, "check", args.check_kinds, seeds, args.check_places)
+    check = _gathered(args, "check", args.check_kinds, seeds, args.check_places, args.check_pairs)
     _print_models(models)
     for name, trials in (("fitted", fit), ("held out", check)):
         print(f"\n{name}: {len(trials)} answers")
@@ -93,14 +116,22 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _gathered(
-    args: argparse.Namespace, name: str, kinds: list[str], seeds: range, num_places: int
+    args: argparse.Namespace,
+    name: str,
+    kinds: list[str],
+    seeds: range,
+    num_places: int,
+    listed: Path | None,
 ) -> list[Trial]:
-    """Evidence of windows, and of maps that were built apart."""
+    """Evidence of windows, of maps that were built apart, and of real ones."""
     trials = gathered(args.out / f"{name}.csv", window_tasks(kinds, args.overlaps, seeds))
     places = range(seeds.start, seeds.start + num_places)
     maps = apart_maps(places, _NUM_VEHICLES, args.cache or args.out / "maps")
     tasks = apart_tasks(maps, _DIFFERENT_OF_PLACE * num_places, seeds.start)
-    return trials + gathered(args.out / f"{name}_apart.csv", tasks, is_apart=True)
+    trials += gathered(args.out / f"{name}_apart.csv", tasks)
+    if listed is not None:
+        trials += gathered(args.out / f"{name}_listed.csv", listed_tasks(listed))
+    return trials
 
 
 def _fitted(trials: list[Trial]) -> VerdictModels:
@@ -110,7 +141,8 @@ def _fitted(trials: list[Trial]) -> VerdictModels:
     second model is of the matches that no convincing rival makes ambiguous anyway.
     """
     features, is_right, weights = [], [], []
-    for trial in trials:
+    trial_weights = weights_of(trials)
+    for trial, weight in zip(trials, trial_weights, strict=True):
         if trial.spec.kind == "symmetric":
             continue
         # Not the best by the model that is being replaced: that would fit it to its own errors.
@@ -118,28 +150,50 @@ def _fitted(trials: list[Trial]) -> VerdictModels:
         for one, is_pose_right in trial.poses:
             features.append(pose_features(one, trial.evidence.log_volume))
             is_right.append(is_pose_right)
-            weights.append(trial.weight * (1.0 if one.score == highest else _OTHER_WEIGHT))
-    pose = _logistic(features, is_right, weights)
-    alone = VerdictModels(pose, (0.0, 1.0, 0.0))
-    left = [t for t in trials if rival_probability(t.evidence, alone) <= MOST_RIVAL_PROBABILITY]
+            weights.append(weight * (1.0 if one.score == highest else _OTHER_WEIGHT))
+    pose = _logistic(POSE_FEATURES, features, is_right, weights)
+    alone = VerdictModels(pose, ())
+    left = [
+        (trial, weight)
+        for trial, weight in zip(trials, trial_weights, strict=True)
+        if rival_probability(trial.evidence, alone) <= MOST_RIVAL_PROBABILITY
+    ]
     match = _logistic(
-        [match_features(t.evidence, pose) for t in left],
-        [t.is_right for t in left],
-        [t.weight for t in left],
+        MATCH_FEATURES,
+        [match_features(trial.evidence, pose) for trial, _ in left],
+        [trial.is_right for trial, _ in left],
+        [weight for _, weight in left],
     )
     return VerdictModels(pose, match)
 
 
 def _logistic(
-    rows: list[tuple[float, ...]], is_right: list[bool], weights: list[float]
+    names: Sequence[str],
+    rows: list[tuple[float, ...]],
+    is_right: list[bool],
+    weights: list[float],
 ) -> tuple[float, ...]:
-    """Coefficients, intercept first, of a ridge-regularised logistic model."""
-    features = np.array(rows)
-    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-9
-    model = LogisticRegression(C=1.0 / _RIDGE, max_iter=5000)
-    model.fit((features - mean) / spread, is_right, sample_weight=weights)
-    slopes = model.coef_[0] / spread
-    intercept = float(model.intercept_[0] - slopes @ mean)
+    """Coefficients, intercept first, of a ridge-regularised logistic model; some are held."""
+    features, answers, weight = np.array(rows), np.array(is_right, float), np.array(weights)
+    held = np.array([_HELD_SLOPES.get(name, math.nan) for name in names])
+    is_free = np.isnan(held)
+    offset = features[:, ~is_free] @ held[~is_free]
+    free = features[:, is_free]
+    mean, spread = free.mean(axis=0), free.std(axis=0) + 1e-9
+    scaled = (free - mean) / spread
+
+    def loss(model: FloatArray) -> tuple[float, FloatArray]:
+        logit = offset + model[0] + scaled @ model[1:]
+        value = weight @ (np.logaddexp(0.0, logit) - answers * logit)
+        slope = weight * (expit(logit) - answers)
+        ridge = np.concatenate([[0.0], _RIDGE * model[1:]])
+        gradient = np.concatenate([[slope.sum()], scaled.T @ slope]) + ridge
+        return float(value + 0.5 * model @ ridge), gradient
+
+    found = minimize(loss, np.zeros(1 + is_free.sum()), jac=True, method="L-BFGS-B").x
+    slopes = held.copy()
+    slopes[is_free] = found[1:] / spread
+    intercept = float(found[0] - slopes[is_free] @ mean)
     return tuple(round(value, 4) for value in (intercept, *map(float, slopes)))
 
 
@@ -160,6 +214,8 @@ def _groups(trials: list[Trial]) -> dict[str, list[Trial]]:
 
     def group(trial: Trial) -> str:
         spec = trial.spec
+        if trial.is_mirrored:
+            return "in a mirror"
         if spec.is_alias:
             return "like ends of one basin"
         if not spec.is_matching:
@@ -170,6 +226,8 @@ def _groups(trials: list[Trial]) -> dict[str, list[Trial]]:
             return "symmetric place"
         if trial.has_prior:
             return "prior window"
+        if spec.kind == "real":
+            return "real maps"
         if trial.is_apart:
             low, high = next(b for b in itertools.pairwise(_APART_BINS) if spec.overlap < b[1])
             return f"apart, {low:.0%} to {high:.0%}".replace("%", " %")
