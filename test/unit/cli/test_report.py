@@ -14,11 +14,14 @@ import pytest
 from unit.cli import missions
 
 from uw_dslam_ros2.cli import map_drawing, pictures
+from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
 from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
 from uw_dslam_ros2.cli.scoring import Scores, Truth, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging import Decision, DecisionKind
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import read_map, write_map
 from uw_dslam_ros2.io.trajectories import write_tum
 
@@ -213,3 +216,44 @@ def test_the_report_shows_what_each_vehicle_knew_when(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "report.json").read_text())["link"] == link
     assert cv2.imread(str(tmp_path / "link.png")) is not None
     _Balance().check(html)
+
+
+def test_what_people_decided_is_listed_with_who_and_when_and_drawn(tmp_path: Path) -> None:
+    queue = missions.settled_queue()
+    ends = {"source": SubmapId("auv_3", 0, 0), "target": SubmapId("auv_1", 0, 0)}
+    motion = missions.T_WORLD_ODOM["auv_1"].inverse() @ missions.T_WORLD_ODOM["auv_3"]
+    who = {"who": "Ann <b>", "stamp_ns": 1_700_000_000 * 10**9}
+    confirm = Decision(
+        DecisionKind.CONFIRM, **ends, T_target_source=motion, sigma_m=0.5, sigma_rad=0.1, **who
+    )
+    queue.decide(Decision(DecisionKind.FORBID, is_run=True, **ends))
+    queue.decide(Decision(DecisionKind.UNDO, undone=1, **who))
+    before = outcome_of(queue)
+    queue.decide(confirm)
+    outcome = outcome_of(queue)
+    write_report(tmp_path, outcome, FACTS, None)
+    html = (tmp_path / "report.html").read_text()
+    assert "Ann &lt;b&gt;" in html
+    assert "2023-11-14 22:13:20" in html
+    for text in ("FORBID, undone", "all of auv_3, all of auv_1", "decision 1", "undone by 2"):
+        assert text in html
+    assert "auv_3/0, auv_1/0" in html
+    rows = json.loads((tmp_path / "report.json").read_text())["decisions"]
+    assert [(row["kind"], row["is_in_force"]) for row in rows] == [
+        ("FORBID", False),
+        ("UNDO", True),
+        ("CONFIRM", True),
+    ]
+    violet = np.array([0x5B, 0x2A, 0x86])[::-1]
+
+    def drawn(what: Outcome) -> bool:
+        data = np.frombuffer(pictures.png_bytes(pictures.before_after(what, "")), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        return bool((np.abs(picture.astype(int) - violet).max(axis=2) < 12).sum() > 50)
+
+    assert not drawn(before)
+    assert drawn(outcome)
+
+
+def test_a_report_without_decisions_does_not_speak_of_them(folder: Path) -> None:
+    assert "Decided by people" not in (folder / "report.html").read_text()

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.cli.decision_rows import DecisionRow
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import (
     Constraint,
@@ -152,6 +153,7 @@ class Outcome:
     registrations: tuple[RegistrationRow, ...]
     provenance: MapProvenance | None = None
     loops: tuple[LoopError, ...] = ()
+    decisions: tuple[DecisionRow, ...] = ()
     unmapped: tuple[str, ...] = ()
     """Vehicles of which there is no map at all."""
 
@@ -233,6 +235,7 @@ def outcome_of(queue: MapQueue) -> Outcome:
         ),
         queue.provenance(),
         tuple(queue.loops()),
+        tuple(DecisionRow.of(record, names) for record in queue.decisions()),
     )
 
 

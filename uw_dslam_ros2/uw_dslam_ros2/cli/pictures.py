@@ -47,7 +47,7 @@ from uw_dslam_ros2.cli.map_drawing import (
 from uw_dslam_ros2.cli.outcome import Outcome
 from uw_dslam_ros2.cli.scoring import Scores, Truth
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.merging import SubmapState
+from uw_dslam_ros2.core.merging import ConstraintKind, SubmapState
 from uw_dslam_ros2.core.metrics import interpolate_poses, resample
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -61,6 +61,7 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
+DECIDED_COLOR = "#5b2a86"
 
 
 def vehicle_colors(vehicles: Sequence[str]) -> dict[str, str]:
@@ -196,7 +197,7 @@ def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str], member
     for record in shown:
         color = colors[record.submap.vehicle_id]
         draw_seam(axes, record.submap.grid, record.T_component_submap, color, opacity)
-    handles: list[Any] = []
+    handles: list[Any] = _draw_confirmed(axes, outcome)
     for vehicle in merged:
         color = colors[vehicle.vehicle_id]
         if vehicle.trajectory is not None:
@@ -215,6 +216,28 @@ def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str], member
     ]
     scale_bar(axes)
     legend_below(axes, handles)
+
+
+def _draw_confirmed(axes: Axes, outcome: Outcome) -> list[Any]:
+    """Draw what a person confirmed; handles for the legend."""
+    places = {
+        r.submap.submap_id: r.T_component_submap
+        for r in outcome.records
+        if r.state is SubmapState.MERGED
+    }
+    style: dict[str, Any] = {"color": DECIDED_COLOR, "lw": 2.0, "ls": (0, (5, 1.5, 1, 1.5))}
+    count = 0
+    for constraint in outcome.constraints:
+        ends = constraint.source, constraint.target
+        if constraint.kind is ConstraintKind.CONFIRMED and all(end in places for end in ends):
+            x = [places[end].x for end in ends]
+            y = [places[end].y for end in ends]
+            axes.plot(x, y, **style)
+            axes.plot(np.mean(x), np.mean(y), marker="D", color=DECIDED_COLOR, ms=6)
+            count += 1
+    if not count:
+        return []
+    return [Line2D([], [], **style, marker="D", label="confirmed by a person")]
 
 
 def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +113,7 @@ def report_dict(outcome: Outcome, facts: RunFacts, scores: Scores) -> dict[str, 
         ],
         "vehicles_not_mapped": list(outcome.unmapped),
         "num_registrations": len(outcome.registrations),
+        "decisions": [asdict(row) for row in outcome.decisions],
         "verdicts": outcome.verdict_counts(),
         "scores": scores.to_dict(),
         "notes": facts.notes,
