@@ -337,3 +337,24 @@ def test_a_fix_is_placed_and_the_map_lies_on_earth(deciding, size):
         tab(page, "Decisions")
         page.get_by_text("The map lies on earth (EPSG:32632)").wait_for()
         page.get_by_text("0.00 m off").wait_for()
+
+
+@SIZES
+def test_nodes_tell_of_themselves_and_of_bytes_on_the_link(deciding, size):
+    with deciding(size) as (page, source):
+        link = {
+            "name": "auv_1/acoustic_link: <i>link</i>", "level": "ok", "age_s": 0.5,
+            "message": "3 submaps known", "values": {"sent bytes cells": "1200"},
+            "sent_bytes": 1200.0, "bits_per_s": 64.0,
+        }  # fmt: skip
+        source.status = lambda: {"is_live": True, "notes": [], "diagnostics": [link]}
+        page.get_by_role("button", name="withdraw the run").first.click()  # asks for the status
+        page.get_by_role("button", name="restore the run").wait_for()
+        tab(page, "Health")
+        page.get_by_text("64 bit/s").wait_for()
+        page.get_by_text("3 submaps known").click()
+        page.get_by_text("sent bytes cells").wait_for()
+        shot(page, "health", size)
+        link["message"] = "4 submaps known"
+        page.get_by_text("4 submaps known").wait_for()
+        assert page.get_by_text("sent bytes cells").is_visible()  # still open

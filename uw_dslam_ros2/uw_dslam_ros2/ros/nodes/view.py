@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from uw_dslam_msgs.msg import MergeStatus
@@ -26,6 +26,7 @@ from uw_dslam_ros2.ros.convert.merging import (
     constraint_from_msg,
     record_from_msg,
 )
+from uw_dslam_ros2.ros.plumbing.diagnostics_board import DiagnosticsBoard
 from uw_dslam_ros2.ros.plumbing.node_settings import ViewConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SERVICES
@@ -71,7 +72,7 @@ class View(Node):
         self._status: MergeStatus | None = None
         self._heard_s = float("-inf")
         self._changed_s: dict[Track, float] = {}
-        self._troubles: dict[str, str] = {}
+        self._board = DiagnosticsBoard()
         self._is_new, self._is_stopped = threading.Event(), threading.Event()
         self._server = ViewServer(
             self, self._config.address, self._config.port, self._config.token
@@ -104,7 +105,7 @@ class View(Node):
     def status(self) -> dict[str, Any]:
         """Ages and what is wrong."""
         now_s = time.monotonic()
-        notes = [f"{name}: {text}" for name, text in sorted(self._troubles.items())]
+        notes = self._board.troubles()
         if now_s - self._heard_s > _SILENT_S:
             notes.insert(0, f"{self._config.manager} is not heard")
         status = self._status
@@ -118,6 +119,7 @@ class View(Node):
                 for track, since_s in list(self._changed_s.items())
             },
             "notes": notes,
+            "diagnostics": self._board.rows(now_s),
         }
 
     def register(self) -> Register:
@@ -161,11 +163,7 @@ class View(Node):
         self._is_new.set()
 
     def _on_diagnostics(self, msg: DiagnosticArray) -> None:
-        for status in msg.status:
-            if status.level == DiagnosticStatus.OK:
-                self._troubles.pop(status.name, None)
-            else:
-                self._troubles[status.name] = status.message
+        self._board.note(msg, time.monotonic())
 
     def _follow(self) -> None:
         while not self._is_stopped.is_set():

@@ -30,8 +30,8 @@ export class Hand {
   }
 
   /** Goes along into a dialog, beside which nothing else can be used. */
-  into(dialog) {
-    dialog.append(this.box);
+  into(dialog, place) {
+    place.append(this.box);
     dialog.addEventListener("close", () => this.home.after(this.box), { once: true });
     this.tell("");
   }
@@ -84,7 +84,7 @@ export class Hand {
         place: [number(x.input.value), number(y.input.value), radians(yaw.input.value || "0")],
       };
     });
-    return element("details", {}, element("summary", {}, "fix this place on earth"), ...[frame, x, y, sigma, yaw, sure].map((f) => f.label), place);
+    return element("details", { className: "form" }, element("summary", {}, "fix this place on earth"), ...[frame, x, y, sigma, yaw, sure].map((f) => f.label), place);
   }
 }
 

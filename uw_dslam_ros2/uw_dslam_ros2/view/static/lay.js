@@ -30,7 +30,7 @@ export class LayDialog {
       at(`lay-${side}`).replaceChildren(...runs.map((run) => element("option", { value: run, selected: run === name }, run)));
     }
     if (!at("lay").open) {
-      this.hand.into(at("lay"));
+      this.hand.into(at("lay"), at("lay-who"));
       at("lay").showModal();
     }
     await this.#load(match);

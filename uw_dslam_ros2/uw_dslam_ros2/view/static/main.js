@@ -96,6 +96,12 @@ async function refresh() {
   }
 }
 
+// What nodes tell of themselves changes without the map changing.
+setInterval(async () => {
+  if (panel.current !== "health" || !panel.status.is_live) return;
+  panel.status = await ask("/api/status").catch(() => panel.status);
+  panel.show(scene);
+}, 2000);
 at("moment").oninput = () => scene && draw();
 listen(refresh, (isThere) => {
   at("connection").textContent = isThere ? "" : "the view is not there: what is shown may be old";

@@ -31,6 +31,8 @@ export class MapView {
   }
 
   show(scene, moment) {
+    // What was lit may not be there any more.
+    if (this.lit && this.scene && this.scene.version !== scene.version) this.highlight([]);
     this.scene = scene;
     this.#cells(scene, moment);
     const visible = new Set(scene.moments.slice(0, moment).map((m) => m.submap));

@@ -44,7 +44,7 @@ export class PairDialog {
     at("pair-rivals").replaceChildren();
     this.#hand();
     if (!at("pair").open) {
-      this.hand.into(at("pair"));
+      this.hand.into(at("pair"), at("pair-who"));
       at("pair").showModal();
     }
     if (!row.pose) {

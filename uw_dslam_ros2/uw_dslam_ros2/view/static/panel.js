@@ -3,7 +3,7 @@ import { attributes, clock, day, element, style_of } from "./api.js";
 import { worded } from "./hand.js";
 import { told } from "./map.js";
 
-const TABS = { vehicles: "Vehicles", matches: "Matches", submaps: "Submaps", cell: "Cell", decisions: "Decisions" };
+const TABS = { vehicles: "Vehicles", matches: "Matches", submaps: "Submaps", cell: "Cell", decisions: "Decisions", health: "Health" };
 const LAYERS = { tracks: "tracks", submaps: "submaps", constraints: "matches", odometry: "odometry" };
 
 export class Panel {
@@ -15,6 +15,7 @@ export class Panel {
     this.current = "vehicles";
     this.found = null;
     this.status = {};
+    this.opened = new Set();
     this.layers = { tracks: true, submaps: false, constraints: true, odometry: false };
     const names = Object.keys(TABS);
     for (const name of names) {
@@ -30,7 +31,7 @@ export class Panel {
   show(scene) {
     this.scene = scene;
     // What somebody is writing is not taken away.
-    if (!this.content.querySelector("details[open]")) this.open(this.current);
+    if (!this.content.querySelector("details.form[open]")) this.open(this.current);
   }
 
   open(name, isFocused = false) {
@@ -125,6 +126,18 @@ export class Panel {
       return card;
     });
     return [element("div", { className: "tools" }, lay), ...(earth ? [earth] : []), ...(cards.length ? cards : ["Nobody has decided anything yet."])];
+  }
+
+  _health() {
+    const rows = this.status.diagnostics || [];
+    if (!rows.length) return [this.status.is_live ? "No node has told of itself yet." : "This is a saved merge: no node runs."];
+    const links = rows.filter((row) => row.sent_bytes !== undefined);
+    const sent = links.map((row) => element("tr", {}, element("td", {}, row.name.split(":")[0]), element("td", {}, `${row.sent_bytes} bytes`), element("td", {}, row.bits_per_s === null ? "" : `${row.bits_per_s.toFixed(0)} bit/s`)));
+    const cards = rows.map((row) => element("details", { className: "card", open: this.opened.has(row.name), ontoggle: (event) => this.opened[event.target.open ? "add" : "delete"](row.name) },
+      element("summary", {}, element("b", {}, row.name.split(":")[0]), " ", element("span", { className: `chip ${row.level === "ok" ? "good" : ""}` }, row.level),
+        element("small", {}, `${row.message}${row.age_s > 5 ? `, ${row.age_s.toFixed(0)} s ago` : ""}`)),
+      element("table", {}, ...Object.entries(row.values).map(([key, value]) => element("tr", {}, element("th", { scope: "row" }, key), element("td", {}, value))))));
+    return [...(links.length ? [element("h3", {}, "sent over the acoustic link"), element("table", {}, ...sent)] : []), ...cards];
   }
 
   _cell() {
