@@ -186,9 +186,11 @@ def test_who_waits_for_a_server_that_is_cleaned_up_gets_an_answer(
         until(result.done, "the action's result")
         assert hand.change(until, Transition.TRANSITION_CONFIGURE)
         assert hand.change(until, Transition.TRANSITION_ACTIVATE)
+        begun.clear()
         goal = acting.send_goal_async(RegisterMapsAction.Goal(source=room, target=room))
         until(goal.done, "a goal again")
         assert goal.result().accepted
+        until(begun.is_set, "its search")
     acting.destroy()
 
 

@@ -43,7 +43,7 @@ _SUBMAP_TYPE = "uw_dslam_msgs/msg/Submap"
 _TICK_S = 0.1
 _STATUS_PERIOD_S = 1.0
 _DISCOVERY_PERIOD_S = 0.5
-_REST_S = 10.0
+_CLOSE_S = 10.0
 """Longest wait for the job at hand."""
 
 
@@ -80,7 +80,7 @@ class MapQueueManager(ManagedNode):
         self._keeper = SessionKeeper(self._config.session, self.complain)
         self._worker = Worker("map queue", self._on_worker_error)
         self.at_end(lambda: self._keeper.close(self._queue))
-        self.at_end(lambda: self._worker.close(_REST_S))
+        self.at_end(lambda: self._worker.close(_CLOSE_S))
         self._resume()
         self._group = ReentrantCallbackGroup()
         self._map = MapPublisher(self, self._config.map_frame, self._config.full_map_period_s)
@@ -122,7 +122,7 @@ class MapQueueManager(ManagedNode):
         """Submaps that come meanwhile are latched, and asked for where they are not."""
         self._topics.clear()
         self._maps.stop()
-        self._worker.call(lambda: self._keeper.save_if_due(self._queue)).result(_REST_S)
+        self._worker.post(lambda: self._keeper.save_if_due(self._queue))
 
     def settings_changed(self) -> None:
         """Rates and limits, from now on."""

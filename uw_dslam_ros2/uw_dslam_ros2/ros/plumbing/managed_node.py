@@ -73,6 +73,7 @@ class ManagedNode(QosOverrides, LifecycleNode):
         }
         self._is_set_up = False
         self._is_active = False
+        self._is_starting = False
         self._problem: Exception | None = None
         self._closing = ExitStack()
         self._before: set[Any] = set()
@@ -83,9 +84,11 @@ class ManagedNode(QosOverrides, LifecycleNode):
             self._go_through()
 
     def _go_through(self) -> None:
+        self._is_starting = True
         for trigger in (self.trigger_configure, self.trigger_activate):
             if trigger() != _SUCCESS:
                 raise self._problem or UwDslamError(f"{self.get_name()} could not be started")
+        self._is_starting = False
 
     # --- what a node does --------------------------------------------------------------------
 
@@ -115,6 +118,8 @@ class ManagedNode(QosOverrides, LifecycleNode):
     def _on_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         given = {parameter.name: parameter.value for parameter in parameters}
         own = {name: value for name, value in given.items() if name in self._names}
+        if not own:
+            return SetParametersResult(successful=True)
         fixed = sorted(name for name in own if self._is_set_up and not self._is_live(name))
         if fixed:
             return SetParametersResult(
@@ -201,7 +206,8 @@ class ManagedNode(QosOverrides, LifecycleNode):
         except Exception as error:  # noqa: BLE001 (who asked for it gets a refusal)
             self._problem = error
             is_told = isinstance(error, UwDslamError)
-            self.get_logger().error(str(error) if is_told else traceback.format_exc())
+            if not self._is_starting:  # else it is raised
+                self.get_logger().error(str(error) if is_told else traceback.format_exc())
             mend()
             return _FAILURE
         return _SUCCESS
