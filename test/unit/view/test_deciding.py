@@ -15,7 +15,8 @@ import pytest
 from unit.cli import missions
 
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
-from uw_dslam_ros2.core.merging import Decision, DecisionKind
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging import Decision, DecisionKind, MapQueue
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.session import Session, SessionInUseError, load_session, save_session
@@ -213,6 +214,22 @@ def test_maps_are_laid_out_as_the_graph_or_a_registration_says():
     assert picture.shape == (40, 44, 4)
     assert picture[-1, 12].tolist() == [0, 159, 230, 255]  # a wall, in orange
     assert 0 < picture[-1 - 10, 12, 3] < 255  # water that lets the other map through
+
+
+def test_a_large_map_is_laid_in_few_cells_that_lie_where_the_many_did():
+    queue, spec = MapQueue(), GridSpec(0.05, 1200, 900, SE2(-3.0, 2.0, 0.3))
+    values = np.zeros(spec.shape, np.int8)
+    values[700, 100:800] = values[200:900, 333] = 100  # walls of one cell
+    submap = dataclasses.replace(missions.submap("auv_1"), grid=OccupancyMap(spec, values))
+    queue.add_submap(submap)
+    laid = run_map(QueueSource("", queue).showing(), "auv_1").occupancy
+    assert max(laid.spec.shape) <= 500
+    true = spec.centers_of(np.argwhere(values == 100))
+    cells = laid.spec.cells_of(true)
+    assert (laid.values[cells[:, 0], cells[:, 1]] > 50).all()
+    # Nothing is a wall that is farther from one than the thickness that is drawn.
+    found = laid.spec.centers_of(np.argwhere(laid.values > 50))
+    assert max(np.hypot(*(true - place).T).min() for place in found) < 2.5 * laid.spec.resolution_m
 
 
 def test_a_map_with_fixes_is_exported_in_coordinates_of_the_earth(tmp_path):

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
 from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.se2 import SE2
@@ -17,6 +18,10 @@ from uw_dslam_ros2.view.pairs import map_picture
 from uw_dslam_ros2.view.showing import Showing
 
 __all__ = ["RunMap", "lay_out", "run_map"]
+
+
+_MAX_SIDE = 500
+"""Rows and columns of a picture: about what a screen shows of the whole of both maps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +63,7 @@ def run_map(showing: Showing, name: str) -> RunMap:
         [T_first_group @ r.T_component_submap for r in records],
         0,
     )
-    return RunMap(first.submap.submap_id, showing.rendered(group))
+    return RunMap(first.submap.submap_id, _coarse(showing.rendered(group)))
 
 
 def lay_out(
@@ -87,6 +92,21 @@ def lay_out(
         "target": maps[1].row(),
         "start": start.as_array().round(4).tolist(),
     }
+
+
+def _coarse(occupancy: OccupancyMap) -> OccupancyMap:
+    """The map in so few cells that a screen shows them; walls outlast the rest."""
+    spec = occupancy.spec
+    step = -(-max(spec.shape) // _MAX_SIDE)
+    if step == 1:
+        return occupancy
+    rows, cols = -(-spec.num_rows // step), -(-spec.num_cols // step)
+    even = np.full((rows * step, cols * step), UNKNOWN, np.int8)
+    even[: spec.num_rows, : spec.num_cols] = occupancy.values
+    values = even.reshape(rows, step, cols, step).max(axis=(1, 3))
+    thick = cv2.dilate(values.astype(np.int16), np.ones((3, 3), np.uint8)).astype(np.int8)
+    values = np.where(thick > 50, thick, values)
+    return OccupancyMap(GridSpec(step * spec.resolution_m, rows, cols, spec.T_frame_grid), values)
 
 
 def _as_registered(
