@@ -221,7 +221,7 @@ def _resident_mib() -> float:
 
 def _closed_bytes(mapper: VehicleMapper) -> int:
     return sum(
-        len(s.evidence.data) + s.points.nbytes + s.weight.nbytes + s.trajectory.nbytes
+        len(s.grid.data) + s.points.nbytes + s.weight.nbytes + s.trajectory.nbytes
         + s.stamps_ns.nbytes
         for s in mapper._closed
     )  # fmt: skip

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mapping.config import WIDE_BEAM_RAD, VehicleMapperConfig
+from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.estimators import make_estimator
-from uw_dslam_ros2.core.mapping.local_map import LocalMap, joined
-from uw_dslam_ros2.core.mapping.matcher import Prior
+from uw_dslam_ros2.core.mapping.key_pings import KeyPings
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
-from uw_dslam_ros2.core.mosaic import Mosaic
+from uw_dslam_ros2.core.mapping.vehicle_map import VehicleMap, path_of
 from uw_dslam_ros2.core.navigation import NavigationFilter
 from uw_dslam_ros2.core.navigation.pose_differences import PoseDifferences
 from uw_dslam_ros2.core.pose_graph import chained_covariance
@@ -48,8 +47,6 @@ _TURN_MEMORY_S = 120.0
 _AHEAD_NS = 1_000_000_000
 """At the end, beams this much newer than all navigation are placed by its last velocity."""
 _FAN_BEAM_RAD = 0.01
-_MIN_OVERLAP = 0.3
-"""Least share of a ping's echoes that must meet known ones for a match to be believed."""
 
 
 class VehicleMapper:
@@ -79,15 +76,13 @@ class VehicleMapper:
         self._watch = watch
         self._navigation = NavigationFilter(config.navigation)
         self._suit(_FAN_BEAM_RAD)
-        self._mosaic = Mosaic(GridSpec(config.occupancy.resolution_m, 1, 1))
+        self._map = VehicleMap(config.occupancy)
         self._closed: list[ClosedSection] = []
         self._open: OpenSection | None = None
         self._last_ping_ns: int | None = None
-        self._last_key: tuple[int, SE2] | None = None
         self._counts: dict[str, float | int | str] = {
-            "num_pings": 0, "num_pings_dropped": 0, "num_pings_empty": 0, "num_key_pings": 0,
-            "num_matches": 0,
-            "num_detections_last": 0, "match_overlap_last": math.nan, "depth_m": math.nan,
+            "num_pings": 0, "num_pings_dropped": 0, "num_pings_empty": 0,
+            "num_detections_last": 0, "depth_m": math.nan,
         }  # fmt: skip
         self._velocity_ns: int | None = None
         self._pose_differences = PoseDifferences()
@@ -313,19 +308,7 @@ class VehicleMapper:
 
     def trajectory(self) -> tuple[NDArray[np.int64], FloatArray]:
         """Stamps (K,) and poses (K, 3) of base_link in odom at every ping, as best known now."""
-        parts = [(s.stamps_ns, s.trajectory) for s in self._closed]
-        if self._open is not None:
-            parts.append((self._open.stamps_ns, self._open.poses))
-        stamps = [np.empty(0, np.int64)]
-        poses = [np.empty((0, 3))]
-        for T_odom_submap, (part_stamps, part) in zip(self._estimator.poses, parts, strict=False):
-            moved = np.column_stack(
-                [T_odom_submap.apply(part[:, :2]), part[:, 2] + T_odom_submap.yaw]
-            )
-            moved[:, 2] = np.mod(moved[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-            stamps.append(part_stamps)
-            poses.append(moved)
-        return np.concatenate(stamps), np.vstack(poses)
+        return path_of(self._closed, self._open, self._estimator.poses)
 
     def vehicle_map(self) -> OccupancyMap:
         """All submaps, the open one included, in odom: as they were last issued.
@@ -334,16 +317,8 @@ class VehicleMapper:
         """
         if not self._closed and self._open is None:
             raise InvalidInputError("there is no map yet, expected a ping with navigation first")
-        mosaic, newest = self._mosaic, len(self._closed)
-        for index, section in enumerate(self._closed):
-            pose = section.T_odom_issued
-            if mosaic.version_of(index) != pose:
-                mosaic.put(index, pose, section.grid, pose)
-        if self._open is not None:
-            mosaic.put(newest, None, self._open.grid.trimmed(), self._estimator.poses[newest])
-        occupancy = mosaic.occupancy(self._config.occupancy.log_odds_max)
-        mosaic.remove(newest)
-        return occupancy or OccupancyMap(mosaic.lattice, np.full((1, 1), UNKNOWN, np.int8))
+        T_odom_newest = self._estimator.poses[-1]
+        return self._map.draw(self._closed, self._open, T_odom_newest)
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counters and the filter's beliefs, by name."""
@@ -356,6 +331,9 @@ class VehicleMapper:
             "vehicle_id": self._vehicle_id,
             "estimator": self._config.estimator,
             **self._counts,
+            "num_key_pings": self._keys.num_pings,
+            "num_matches": self._keys.num_matches,
+            "match_overlap_last": self._keys.overlap_last,
             "num_submaps": len(self._closed),
             "num_loops": self._estimator.num_loops,
             "num_loops_believed": self._estimator.num_loops_believed,
@@ -396,7 +374,7 @@ class VehicleMapper:
         """Take settings that are left to the sonar from the first that is known of it."""
         self._config = self._own_config.suited(beamwidth_rad)
         self._estimator = make_estimator(self._config)
-        self._local_map = LocalMap(self._config.match)
+        self._keys = KeyPings(self._config, self._navigation)
 
     def _add_sweeps(self, sweeps: list[Sweep]) -> list[Submap]:
         issued: list[Submap] = []
@@ -434,8 +412,8 @@ class VehicleMapper:
         if self._open is None:
             self._begin(stamp_ns)
         assert self._open is not None
-        if self._is_key(stamp_ns):
-            self._match(detections, T_base_sonar)
+        if self._keys.is_due(stamp_ns):
+            self._keys.match(detections, T_base_sonar)
         T_submap_base, covariance = self._navigation.relative_at(stamp_ns)
         # At the submap's own start the covariance is zero, which may come out as a trace below it.
         sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
@@ -463,57 +441,13 @@ class VehicleMapper:
             self._estimator.add_first(T_odom_base, odom_covariance)
         else:
             self._estimator.add_next(T_previous_new, covariance)
-            self._local_map.rebase(T_previous_new.inverse())
-            if self._last_key is not None:
-                self._last_key = (self._last_key[0], T_previous_new.inverse() @ self._last_key[1])
+            self._keys.rebase(T_previous_new.inverse())
         watch = None
         if self._watch is not None:
             submap_id = SubmapId(self._vehicle_id, self._run_id, index)
             watch = functools.partial(self._watch, submap_id)
         self._open = OpenSection(self._config, index, covariance, watch)
         self._navigation.clone(stamp_ns)
-
-    def _is_key(self, stamp_ns: int) -> bool:
-        if self._config.estimator == "dead_reckoning":
-            return False
-        if self._last_key is None:
-            return True
-        config = self._config.match
-        last_ns, last = self._last_key
-        distance, turn = last.distance_to(self._navigation.relative_at(stamp_ns)[0])
-        return (
-            distance >= config.key_distance_m
-            or turn >= config.key_turn_rad
-            or (stamp_ns - last_ns) * 1e-9 >= config.key_interval_s
-        )
-
-    def _match(self, detections: Detections, T_base_sonar: SE2) -> None:
-        """Correct the pose of now by the echoes of this ping, then remember them."""
-        stamp_ns = detections.stamp_ns
-        points = T_base_sonar.apply(detections.points)
-        T_submap_base, covariance = self._navigation.relative_at(stamp_ns)
-        # A turn later the place may be another one: then there is nothing that should match.
-        is_comparable = detections.beamwidth_rad < WIDE_BEAM_RAD or self._local_map.is_near(
-            T_submap_base.apply(points)
-        )
-        if is_comparable:
-            self._count("num_key_pings")
-        # A pose that is exactly known cannot be corrected; a millimetre keeps the algebra regular.
-        prior = Prior(T_submap_base, covariance + np.diag([1e-6, 1e-6, 1e-8]))
-        match = self._local_map.match(points, detections.weight, prior)
-        if match is not None:
-            self._counts["match_overlap_last"] = match.overlap
-            if match.overlap >= _MIN_OVERLAP:
-                if is_comparable:
-                    self._count("num_matches")
-                self._navigation.add_fix(stamp_ns, match.T_target_source, match.information)
-                T_submap_base, _ = self._navigation.relative_at(stamp_ns)
-        if len(points):
-            walls, weight = joined(
-                points, detections.weight, detections.beamwidth_rad, self._config.match.sigma_m
-            )
-            self._local_map.add(T_submap_base.apply(walls), weight, T_submap_base)
-        self._last_key = (stamp_ns, T_submap_base)
 
     def _close(self, drift: FloatArray) -> list[Submap]:
         """Close the open submap, look for loops, and say which submaps are new or have moved."""

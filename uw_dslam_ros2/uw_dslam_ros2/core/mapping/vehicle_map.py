@@ -1,0 +1,58 @@
+"""What a vehicle's submaps make together: one map, and one path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.mapping.config import OccupancyConfig
+from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
+from uw_dslam_ros2.core.mosaic import Mosaic
+from uw_dslam_ros2.core.se2 import SE2
+
+__all__ = ["VehicleMap", "path_of"]
+
+FloatArray = NDArray[np.float64]
+
+
+class VehicleMap:
+    """The sum of a vehicle's submaps; asked again, only what is new or has moved is drawn."""
+
+    def __init__(self, config: OccupancyConfig) -> None:
+        self._log_odds_max = config.log_odds_max
+        self._mosaic = Mosaic(GridSpec(config.resolution_m, 1, 1))
+
+    def draw(
+        self, closed: Sequence[ClosedSection], growing: OpenSection | None, T_odom_growing: SE2
+    ) -> OccupancyMap:
+        """All submaps in odom; closed ones lie where they were last issued."""
+        mosaic, newest = self._mosaic, len(closed)
+        for index, section in enumerate(closed):
+            pose = section.T_odom_issued
+            if mosaic.version_of(index) != pose:
+                mosaic.put(index, pose, section.grid, pose)
+        if growing is not None:
+            mosaic.put(newest, None, growing.grid.trimmed(), T_odom_growing)
+        occupancy = mosaic.occupancy(self._log_odds_max)
+        mosaic.remove(newest)
+        return occupancy or OccupancyMap(mosaic.lattice, np.full((1, 1), UNKNOWN, np.int8))
+
+
+def path_of(
+    closed: Sequence[ClosedSection], growing: OpenSection | None, T_odom_submap: Sequence[SE2]
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Stamps (K,) and poses (K, 3) in odom of all pings, submaps lying where they are said to."""
+    parts = [(section.stamps_ns, section.trajectory) for section in closed]
+    if growing is not None:
+        parts.append((growing.stamps_ns, growing.poses))
+    stamps = [np.empty(0, np.int64)]
+    poses = [np.empty((0, 3))]
+    for motion, (part_stamps, part) in zip(T_odom_submap, parts, strict=False):
+        moved = np.column_stack([motion.apply(part[:, :2]), part[:, 2] + motion.yaw])
+        moved[:, 2] = np.mod(moved[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+        stamps.append(part_stamps)
+        poses.append(moved)
+    return np.concatenate(stamps), np.vstack(poses)
