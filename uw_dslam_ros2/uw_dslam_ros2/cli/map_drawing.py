@@ -98,11 +98,12 @@ def set_title(axes: Axes, text: str, warning: str = "") -> None:
 
 def cropped(occupancy: OccupancyMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last (exclusive) cell of what is known, with a margin."""
-    seen = np.argwhere(occupancy.known)
-    if len(seen) == 0:
+    known = occupancy.known
+    seen = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
+    if len(seen[0]) == 0:
         return np.zeros(2, np.int64), np.array(occupancy.spec.shape)
-    low = np.maximum(seen.min(axis=0) - _MARGIN_CELLS, 0)
-    high = np.minimum(seen.max(axis=0) + 1 + _MARGIN_CELLS, occupancy.spec.shape)
+    low = np.maximum([along[0] - _MARGIN_CELLS for along in seen], 0)
+    high = np.minimum([along[-1] + 1 + _MARGIN_CELLS for along in seen], occupancy.spec.shape)
     return low, high
 
 

@@ -342,7 +342,7 @@ def _picture(values: NDArray[np.int8]) -> FloatArray:
 
 def _covering(spec: GridSpec, other: OccupancyMap, T_frame_other: SE2) -> GridSpec:
     """Extend a grid by whole cells to cover all that another map knows."""
-    known = np.argwhere(other.known)
+    known = _ends_of_rows(other.known)
     if len(known) == 0:
         return spec
     cells = spec.cells_of(T_frame_other.apply(other.spec.centers_of(known)))
@@ -353,6 +353,14 @@ def _covering(spec: GridSpec, other: OccupancyMap, T_frame_other: SE2) -> GridSp
     if not low.any():
         corner = spec.T_frame_grid
     return GridSpec(spec.resolution_m, num_rows, num_cols, corner)
+
+
+def _ends_of_rows(mask: BoolArray) -> IntArray:
+    """First and last cell (N, 2) of each row that has any: no other lies farther out."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    first = mask[rows].argmax(axis=1)
+    last = mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1)
+    return np.column_stack([np.tile(rows, 2), np.concatenate([first, last])])
 
 
 def _interior(counts: BoolArray) -> BoolArray:

@@ -49,7 +49,7 @@ class PingTrack:
 def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]:
     """The same pings where all of them see the same walls; see `refine_tracks`."""
     found = refine_tracks(
-        [Track(t.T_map_sonar, [p.points.astype(np.float64) for p in t.pings]) for t in tracks],
+        [Track(t.T_map_sonar, [p.points for p in t.pings]) for t in tracks],
         noise_m=resolution_m,
         block_m=_BLOCK_M + _BLOCK_CELLS * resolution_m,
     )

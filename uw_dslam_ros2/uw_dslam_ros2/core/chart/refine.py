@@ -43,7 +43,7 @@ class Track:
     """Pings of one vehicle in order: ``T_map_sonar`` (K, 3), and each one's echoes (N, 2) [m]."""
 
     poses: FloatArray
-    echoes: Sequence[FloatArray]
+    echoes: Sequence[NDArray[np.floating]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +107,7 @@ def _arranged(tracks: Sequence[Track]) -> _Problem:
         owners.append(np.full(count, t))
         first += count
         for points in track.echoes:
-            kept = points[:: max(1, -(-len(points) // _MAX_ECHOES))]
+            kept = points[:: max(1, -(-len(points) // _MAX_ECHOES))].astype(np.float64)
             pings.append(np.full(len(kept), num_pings))
             echoes.append(kept)
             num_pings += 1
