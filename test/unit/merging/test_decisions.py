@@ -18,6 +18,7 @@ from uw_dslam_ros2.core.merging import (
     MapQueue,
     MapQueueConfig,
     SubmapState,
+    planning,
 )
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
@@ -308,6 +309,46 @@ def test_the_frame_goes_where_a_person_pins_it_and_back():
     again.decide(undo(1))
     answer_all(again, KNOWING)
     assert map_bytes(again) == before
+
+
+@pytest.fixture
+def liar(monkeypatch):
+    """A queue in which the run of auv_1 is set aside; ``blamed`` holds it, for who forgives."""
+    blamed = [id_of(1, 0).track]
+
+    def blame(library, *_):
+        return next((t for t in blamed if any(i.track == t for i in library.submaps)), None)
+
+    monkeypatch.setattr(planning, "contradicting_track", blame)
+    queue = settled()
+    assert {r.state for r in queue.submaps()} == {SubmapState.SET_ASIDE, SubmapState.MERGED}
+    return queue, blamed
+
+
+def test_a_pin_on_what_is_set_aside_waits_and_the_others_keep_their_map(liar):
+    queue, blamed = liar
+    queue.decide(about(DecisionKind.PIN, id_of(1, 1)))
+    answer_all(queue, KNOWING)
+    assert {r.submap.vehicle_id for r in queue.submaps() if r.state is SubmapState.MERGED} == {
+        "auv_2",
+        "auv_3",
+    }
+    assert remark_of(queue, 1) == "waits: auv_1/1 is set aside"
+    blamed.clear()
+    queue.add_submap(dataclasses.replace(FLEET.submaps[id_of(1, 3)], revision=1))
+    answer_all(queue, KNOWING)
+    poses = {r.submap.submap_id: (r.component, r.T_component_submap) for r in queue.submaps()}
+    assert poses[id_of(1, 1)] == (0, SE2())
+    assert remark_of(queue, 1) == ""
+
+
+@pytest.mark.parametrize("is_growing", [False, True])
+def test_what_a_person_confirms_is_not_set_aside(liar, is_growing):
+    queue, _ = liar
+    queue.is_growing = is_growing
+    queue.decide(confirm(id_of(1, 2), id_of(2, 1)))
+    assert SubmapState.SET_ASIDE not in {r.state for r in queue.submaps()}
+    assert groups(queue) == [["auv_1", "auv_2", "auv_3"]]
 
 
 def fix(submap_id, T_earth_map, queue, point=(0.0, 0.0), yaw=False, off=SE2(), **rest):

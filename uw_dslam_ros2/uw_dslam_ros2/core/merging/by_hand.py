@@ -110,6 +110,7 @@ def remarks(
 ) -> dict[int, str]:
     """What became of each decision, for people; empty where there is nothing to say."""
     told = {decision.number: "" for decision in log}
+    placed = component_numbers(plan.components)
     questions = {decision.number: query for decision, query in _questions(library)}
     for decision in log:
         number = decision.number
@@ -129,8 +130,11 @@ def remarks(
                     if answer is None
                     else f"{answer.verdict.name}: {answer.why}"
                 )
-        elif decision.kind is DecisionKind.PIN and decision.source != log.pin:
-            told[number] = "replaced by a later decision"
+        elif decision.kind is DecisionKind.PIN:
+            if decision.source != log.pin:
+                told[number] = "replaced by a later decision"
+            elif decision.source not in placed:
+                told[number] = f"waits: {decision.source} is set aside"
         elif decision.kind is DecisionKind.FIX:
             told[number] = _of_fix(decision, georeference)
     return told

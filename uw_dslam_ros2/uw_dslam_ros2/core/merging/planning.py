@@ -72,22 +72,26 @@ class Planning:
         def plan_with(sound: Library) -> Plan:
             return self._plan_with(sound, tracks, answers, standing, anchor, is_growing=is_growing)
 
+        # A person wants them in the map.
+        wanted_tracks = {end.track for decision in library.confirmed for end in decision.pair}
         plan = plan_with(library)
         if not is_growing and not plan.wanted:
             self._contradicting = []
             whole, sound = plan, library
             while len(self._contradicting) < len(tracks) and not plan.wanted:
                 track, why = self._unsound(sound, plan)
-                if track is None or any(
-                    track in (end.track for end in decision.pair) for decision in library.confirmed
-                ):
-                    break  # a person wants it in the map
+                if track is None or track in wanted_tracks:
+                    break
                 self._contradicting.append(track)
                 self._why[track] = why
                 sound = library.without(self._contradicting)
                 plan = plan_with(sound)
             plan = dataclasses.replace(plan, wanted=[*whole.wanted, *plan.wanted])
-        elif held := [track for track in self._contradicting if track in tracks]:
+        elif held := [
+            track
+            for track in self._contradicting
+            if track in tracks and track not in wanted_tracks
+        ]:
             # While questions are open, what was judged before goes on to hold.
             wanted = plan.wanted
             plan = plan_with(library.without(held))
@@ -97,7 +101,7 @@ class Planning:
         self.aside = self._implausible | {
             i: f"set aside with its whole run, {self._why[i.track]}"
             for i in library.submaps
-            if i.track in self._contradicting
+            if i.track in self._contradicting and i.track not in wanted_tracks
         }
         return plan
 

@@ -407,10 +407,7 @@ class MapQueue:
                 return Plan([], [], [], [])
             library = self._current_library()
             pin = self._decisions.pin
-            if pin in library.submaps:
-                assert pin is not None
-                self._note_frame(self._frame.hold(pin, library.submaps[pin]))
-            elif self._frame.anchor not in library.submaps:
+            if self._frame.anchor not in library.submaps:
                 self._note_frame(self._frame.choose(self._sound(library)))
             plan = self._planning.plan(
                 library,
@@ -425,9 +422,12 @@ class MapQueue:
             )
             self._plan_cache, self._questions = plan, plan.wanted
             is_open = self._is_growing or bool(plan.wanted) or bool(self._in_flight)
-            if pin not in library.submaps and self._note_frame(
-                self._frame.settle(plan, self._sound(library), is_open)
-            ):
+            sound = self._sound(library)
+            if pin is not None and pin in sound:
+                has_moved = self._frame.hold(pin, sound[pin])
+            else:
+                has_moved = self._frame.settle(plan, sound, is_open)
+            if self._note_frame(has_moved):
                 self._plan_cache = None
                 return self._plan()
         return self._plan_cache
