@@ -7,16 +7,17 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.arrivals import Arrivals
 from uw_dslam_ros2.core.merging.asking.plan import Plan
 from uw_dslam_ros2.core.merging.by_hand import remarks, stated_pose
-from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MapQueueConfig
+from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.decisions import (
     Decision,
     DecisionKind,
     DecisionLog,
     DecisionRecord,
 )
+from uw_dslam_ros2.core.merging.drawing import Drawing
 from uw_dslam_ros2.core.merging.frame import GlobalFrame
 from uw_dslam_ros2.core.merging.georeference import Georeference, georeference_of
-from uw_dslam_ros2.core.merging.global_map import GlobalMap, undrawable
+from uw_dslam_ros2.core.merging.global_map import GlobalMap
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import LoopError
 from uw_dslam_ros2.core.merging.graph.library import Library
@@ -59,7 +60,7 @@ class MapQueue:
         self._decisions = DecisionLog()
         self._frame = GlobalFrame(self._config.anchor_vehicle, self._config.resolution_m)
         self._planning = Planning(self._config)
-        self._undrawn: tuple[Plan | None, dict[SubmapId, str]] = (None, {})
+        self._drawing = Drawing()
         self._answers: dict[QueryKey, Answer] = {}
         self._standing: frozenset[QueryKey] = frozenset()
         self._library: Library | None = None
@@ -67,9 +68,7 @@ class MapQueue:
         self._in_flight: dict[int, Query] = {}
         self._next_request_id = 1
         self._plan_cache: Plan | None = None
-        self._global_map: GlobalMap | None = None
         self._is_growing = False
-        self._is_drawn = False
 
     def add_submap(self, submap: Submap) -> bool:
         """Take a submap; a higher revision replaces, an equal or lower one changes nothing.
@@ -111,7 +110,8 @@ class MapQueue:
         if query is None:
             return
         self._answers[query.key] = Answer.of(query, result)
-        self._plan_cache, self._is_drawn = None, False
+        self._plan_cache = None
+        self._drawing.note_change()
 
     def correct_answer(self, key: QueryKey, result: RegistrationResult) -> None:
         """Put another answer in the place of one that was had; no such one: nothing changes."""
@@ -386,8 +386,8 @@ class MapQueue:
         self._change()
 
     def _change(self) -> None:
-        self._plan_cache, self._is_drawn = None, False
-        self._questions = []
+        self._plan_cache, self._questions = None, []
+        self._drawing.note_change()
 
     def _open_questions(self) -> list[Query]:
         """Of the last plan while few of its questions are answered, else of a new one.
@@ -439,8 +439,7 @@ class MapQueue:
 
     def _note_frame(self, has_moved: bool) -> bool:
         if has_moved:
-            self._global_map = None
-            self._is_drawn = False
+            self._drawing.restart()
         return has_moved
 
     def _request(self, query: Query) -> MatchRequest:
@@ -462,26 +461,13 @@ class MapQueue:
         )
 
     def _undrawable(self) -> dict[SubmapId, str]:
-        merged = self._merged()
-        if self._frame.lattice is None:
-            return {}
-        if self._undrawn[0] is not self._plan_cache:
-            self._undrawn = (
-                self._plan_cache,
-                undrawable(self._frame.lattice, self._submaps, merged),
-            )
-        return self._undrawn[1]
+        merged = self._merged()  # may move the frame, hence first
+        lattice = self._frame.lattice
+        return {} if lattice is None else self._drawing.left_out(lattice, self._submaps, merged)
 
     def _drawn(self) -> GlobalMap | None:
-        """The global map, up to date: draws only what is new or has moved."""
         merged = self._merged()  # may move the frame, hence first
         if self._frame.lattice is None:
             return None
-        if self._global_map is None:
-            self._global_map = GlobalMap(self._frame.lattice, LOG_ODDS_MAX)
-        if not self._is_drawn:
-            left_out = self._decisions.withdrawn(merged) | self._undrawable().keys()
-            shown = {i: T for i, T in merged.items() if i not in left_out}
-            self._global_map.draw(self._submaps, shown)
-            self._is_drawn = True
-        return self._global_map
+        withdrawn = self._decisions.withdrawn(merged)
+        return self._drawing.drawn(self._frame.lattice, self._submaps, merged, withdrawn)
