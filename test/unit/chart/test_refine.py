@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.chart.refine import Track, refine_tracks
+from uw_dslam_ros2.core.chart.refine import Track, range_scales, refine_tracks
 from uw_dslam_ros2.core.metrics import align_points
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -74,3 +74,11 @@ def test_pings_without_echoes_stay_where_they_are():
     poses = there_and_back(8.0)[:10]
     (found,) = refine_tracks([Track(poses, [np.empty((0, 2))] * 10)], 0.05, 0.8)
     np.testing.assert_array_equal(found, poses)
+
+
+@pytest.mark.parametrize(("scale", "expected"), [(1.03, 1.0 / 1.03), (1.0, 1.0), (0.97, 1.0)])
+def test_ranges_that_are_too_long_are_found(scale, expected):
+    rng = np.random.default_rng(3)
+    true = [there_and_back(7.0), there_and_back(13.0)]
+    tracks = [Track(p, [scale * echoes_of_room(q, rng) for q in p]) for p in true]
+    assert range_scales(tracks, 0.05, 0.8) == pytest.approx([expected] * 2, abs=0.006)

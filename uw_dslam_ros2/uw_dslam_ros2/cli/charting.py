@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.cli.outcome import Outcome, VehicleOutcome
 from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart, refined
 from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
@@ -20,11 +21,14 @@ from uw_dslam_ros2.core.submap import SubmapId, Track
 __all__ = ["PingTracks", "chart_tracks", "charted"]
 
 FloatArray = NDArray[np.float64]
+Tell = Callable[[Finding], None]
 Pings = Mapping[SubmapId, Sequence[DrawnPing]]
 PingTracks = dict[Track, PingTrack]
 
 
-def charted(outcome: Outcome, pings: Pings, config: OccupancyConfig) -> Outcome:
+def charted(
+    outcome: Outcome, pings: Pings, config: OccupancyConfig, tell: Tell | None = None
+) -> Outcome:
     """The outcome with its global map drawn anew, and the trajectories that belong to that.
 
     Parameters
@@ -33,16 +37,35 @@ def charted(outcome: Outcome, pings: Pings, config: OccupancyConfig) -> Outcome:
         Of every submap.
     config
         The sensor model; cells are as large as those of the map that is replaced.
+    tell
+        Called with what the walls show to be wrong.
     """
     before, after = chart_tracks(outcome, pings)
     if outcome.global_map is None or not after:
         return outcome
+    if tell is not None:
+        for track, pings_of_track in after.items():
+            if pings_of_track.range_scale != 1.0:
+                tell(_too_long(track.vehicle_id, pings_of_track.range_scale))
     resolution_m = outcome.global_map.spec.resolution_m
     chart = draw_chart(
         list(after.values()), dataclasses.replace(config, resolution_m=resolution_m), LOG_ODDS_MAX
     )
     vehicles = tuple(_bent(vehicle, before, after) for vehicle in outcome.vehicles)
     return dataclasses.replace(outcome, global_map=chart, vehicles=vehicles)
+
+
+def _too_long(vehicle_id: str, range_scale: float) -> Finding:
+    return Finding(
+        "sound_speed",
+        "sonar",
+        f"walls that it saw from several places meet where its ranges are taken "
+        f"{100.0 * (1.0 - range_scale):.1f} % shorter, as with a speed of sound that is too high "
+        "for colder or fresher water; the chart is drawn so, and all is mapped so with "
+        f"conventions.sonar_range_scale: {range_scale:.3f}",
+        0.9,
+        vehicle_id=vehicle_id,
+    )
 
 
 def chart_tracks(outcome: Outcome, pings: Pings) -> tuple[PingTracks, PingTracks]:
@@ -76,8 +99,7 @@ def _bent(vehicle: VehicleOutcome, before: PingTracks, after: PingTracks) -> Veh
         return vehicle
     stamps_ns, poses = vehicle.trajectory
     ping_ns = np.concatenate([before[track].stamps_ns for track in own])
-    moved = np.vstack([after[track].T_map_sonar - before[track].T_map_sonar for track in own])
-    moved[:, 2] = wrap_angle(moved[:, 2])
+    moved = np.vstack([_moved(before[track], after[track]) for track in own])
     order = np.argsort(ping_ns, kind="stable")
     # Relative to the first: nanoseconds since 1970 do not fit a double.
     start_ns = int(ping_ns.min())
@@ -85,3 +107,11 @@ def _bent(vehicle: VehicleOutcome, before: PingTracks, after: PingTracks) -> Veh
     new = poses + np.column_stack([np.interp(at, known, column) for column in moved[order].T])
     new[:, 2] = wrap_angle(new[:, 2])
     return dataclasses.replace(vehicle, trajectory=(stamps_ns, new))
+
+
+def _moved(before: PingTrack, after: PingTrack) -> FloatArray:
+    """How each pose (K, 3) changes; a turn of all alike is the sonar's mounting, no heading."""
+    moved = after.T_map_sonar - before.T_map_sonar
+    moved[:, 2] = wrap_angle(moved[:, 2])
+    moved[:, 2] -= moved[:, 2].mean()
+    return moved

@@ -121,6 +121,9 @@ def _run(args: argparse.Namespace) -> int:
 
     outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
     findings += left_out(outcome)
+    pings = {key: own for made in mapped for key, own in made.pings.items()}
+    occupancy = config.mapper[mapped[0].vehicle_id].occupancy
+    outcome = charted(outcome, pings, occupancy, findings.append)
     facts = RunFacts(
         title=args.title or "offline: " + ", ".join(vehicles),
         source=[bag.name for bag in bags],
@@ -134,8 +137,6 @@ def _run(args: argparse.Namespace) -> int:
     )
     for note in facts.notes:
         print(f"warning: {note}", file=sys.stderr, flush=True)
-    pings = {key: own for made in mapped for key, own in made.pings.items()}
-    outcome = charted(outcome, pings, config.mapper[mapped[0].vehicle_id].occupancy)
     save_session(args.out / SESSION_FOLDER, queue)  # for view, and to go on from
     scores = write_report(args.out, outcome, facts, truth, has_pictures=not args.no_report)
     done_s = time.monotonic()
@@ -161,7 +162,7 @@ def left_out(outcome: Outcome) -> list[Finding]:
                 "partly_merged" if vehicle.is_merged else "not_merged",
                 "",
                 f"{what} no place in the common map, for no registration is sure enough "
-                f"({vehicle.reason}); does it see walls that others see?",
+                f"({vehicle.reason}); does its sonar see walls that others see?",
                 vehicle_id=vehicle.vehicle_id,
             )
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.chart.pings import DrawnPing
-from uw_dslam_ros2.core.chart.refine import Track, refine_tracks
+from uw_dslam_ros2.core.chart.refine import Track, range_scales, refine_tracks
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
@@ -28,10 +29,14 @@ _ROUNDED = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PingTrack:
-    """Pings of one vehicle in order of time, and ``T_map_sonar`` (K, 3) of each."""
+    """Pings of one vehicle in order of time, and ``T_map_sonar`` (K, 3) of each.
+
+    Ranges are drawn times ``range_scale``.
+    """
 
     pings: Sequence[DrawnPing]
     T_map_sonar: FloatArray
+    range_scale: float = 1.0
 
     def __post_init__(self) -> None:
         expected = (len(self.pings), 3)
@@ -48,14 +53,17 @@ class PingTrack:
 
 def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]:
     """The same pings where all of them see the same walls; see `refine_tracks`."""
-    found = refine_tracks(
-        [Track(t.T_map_sonar, [p.points for p in t.pings]) for t in tracks],
-        noise_m=resolution_m,
-        block_m=_BLOCK_M + _BLOCK_CELLS * resolution_m,
-    )
+    block_m = _BLOCK_M + _BLOCK_CELLS * resolution_m
+    paths = [Track(t.T_map_sonar, [p.points for p in t.pings]) for t in tracks]
+    scales = range_scales(paths, resolution_m, block_m)
+    scaled = [
+        dataclasses.replace(path, range_scale=scale)
+        for path, scale in zip(paths, scales, strict=True)
+    ]
+    found = refine_tracks(scaled, resolution_m, block_m)
     return [
-        PingTrack(track.pings, np.round(poses, _ROUNDED))
-        for track, poses in zip(tracks, found, strict=True)
+        PingTrack(track.pings, np.round(poses, _ROUNDED), round(scale, _ROUNDED))
+        for track, poses, scale in zip(tracks, found, scales, strict=True)
     ]
 
 
@@ -74,5 +82,5 @@ def draw_chart(
     grid = GrowingGrid(config)
     for track in tracks:
         for ping, pose in zip(track.pings, track.T_map_sonar, strict=True):
-            grid.add(ping.detections(), SE2.from_array(pose))
+            grid.add(ping.detections(track.range_scale), SE2.from_array(pose))
     return grid.trimmed().to_occupancy(log_odds_max) if grid.num_pings else None

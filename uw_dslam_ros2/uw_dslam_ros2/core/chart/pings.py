@@ -33,14 +33,14 @@ class DrawnPing:
     beamwidth_rad: float
     range_sigma_m: float
 
-    def detections(self) -> Detections:
-        """In full."""
+    def detections(self, range_scale: float = 1.0) -> Detections:
+        """In full, with a factor on all ranges."""
         return Detections(
             self.stamp_ns,
-            self.points.astype(np.float64),
+            self.points.astype(np.float64) * range_scale,
             self.weight.astype(np.float64),
             self.bearing_rad,
-            self.free_range_m.astype(np.float64),
+            self.free_range_m.astype(np.float64) * range_scale,
             self.beamwidth_rad,
             self.range_sigma_m,
         )

@@ -18,7 +18,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
-__all__ = ["Track", "refine_tracks"]
+__all__ = ["Track", "range_scales", "refine_tracks"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -28,10 +28,13 @@ _NODE_M = 2.0
 _BEND_SIGMA_M, _BEND_SIGMA_RAD = 0.04, 0.004
 """How much one node's correction differs from the next one's."""
 _ANCHOR_SIGMA_M, _ANCHOR_SIGMA_RAD = 0.5, 0.02
+_STRETCH_SIGMA, _MIN_STRETCH = 0.02, 0.01
+"""Of ranges, by a speed of sound that nobody set; what is less may come of thick echoes."""
+_NO_STRETCH = 1e-6
 _INFORMATION_SHARE = 0.1
 """Neighbouring echoes err together."""
 _ITERATIONS = 10
-_MAX_ECHOES = 60
+_MAX_ECHOES, _FEW_ECHOES = 60, 20
 """Of one ping; more of the same walls add time, not accuracy."""
 _LEAST_ECHOES = 12
 _MAX_FLATNESS = 0.15
@@ -40,10 +43,14 @@ _MAX_FLATNESS = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Pings of one vehicle in order: ``T_map_sonar`` (K, 3), and each one's echoes (N, 2) [m]."""
+    """Pings of one vehicle in order: ``T_map_sonar`` (K, 3), and each one's echoes (N, 2) [m].
+
+    Ranges count times ``range_scale``.
+    """
 
     poses: FloatArray
     echoes: Sequence[NDArray[np.floating]]
+    range_scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,20 +85,43 @@ def refine_tracks(tracks: Sequence[Track], noise_m: float, block_m: float) -> li
     block_m
         Side of the squares in which a wall is straight; poses that are farther off are not found.
     """
-    problem = _arranged(tracks)
+    problem = _arranged(tracks, _MAX_ECHOES)
     if len(problem.echo) == 0:
         return [track.poses for track in tracks]
-    bend = np.zeros((problem.num_nodes, 3))
-    prior = _prior(problem)
-    for iteration in range(_ITERATIONS):
-        shift = 0.5 * block_m * (iteration % 2)
-        width = max(noise_m, 0.25 * block_m * 0.6**iteration)
-        bend += _step(problem, bend, prior, block_m, shift, noise_m, width)
-    poses = problem.poses + _bends(problem, bend)
+    found = _solved(problem, noise_m, block_m, stretch_sigma=0.0)
+    poses = problem.poses + _bends(problem, found)
     return [poses[problem.track == t] for t in range(len(tracks))]
 
 
-def _arranged(tracks: Sequence[Track]) -> _Problem:
+def range_scales(tracks: Sequence[Track], noise_m: float, block_m: float) -> list[float]:
+    """Factor on each track's ranges without which its pings do not agree; mostly 1.
+
+    Ranges that are too long draw a map that is too large, and poses would follow it. A path and
+    ranges that are both too long agree, so that only the path's own measure tells: ranges that
+    are said to be too *short* are left alone, for it is rather that measure which is too long (see
+    `core.doctor`). Parameters as in `refine_tracks`.
+    """
+    problem = _arranged(tracks, _FEW_ECHOES)
+    if len(problem.echo) == 0:
+        return [1.0] * len(tracks)
+    found = _solved(problem, noise_m, block_m, _STRETCH_SIGMA)
+    stretches = found[3 * problem.num_nodes :]
+    return [1.0 + float(s) if s < -_MIN_STRETCH else 1.0 for s in stretches]
+
+
+def _solved(problem: _Problem, noise_m: float, block_m: float, stretch_sigma: float) -> FloatArray:
+    """Bends of all nodes (3 M,), then stretches of all tracks (T,)."""
+    num_tracks = int(problem.node_track.max()) + 1
+    found = np.zeros(3 * problem.num_nodes + num_tracks)
+    prior = _prior(problem, num_tracks, max(stretch_sigma, _NO_STRETCH))
+    for iteration in range(_ITERATIONS):
+        shift = 0.5 * block_m * (iteration % 2)
+        width = max(noise_m, 0.25 * block_m * 0.6**iteration)
+        found += _step(problem, found, prior, block_m, shift, noise_m, width)
+    return found
+
+
+def _arranged(tracks: Sequence[Track], max_echoes: int) -> _Problem:
     nodes, shares, centers, owners, pings, echoes, first = [], [], [], [], [], [], 0
     num_pings = 0
     for t, track in enumerate(tracks):
@@ -107,7 +137,8 @@ def _arranged(tracks: Sequence[Track]) -> _Problem:
         owners.append(np.full(count, t))
         first += count
         for points in track.echoes:
-            kept = points[:: max(1, -(-len(points) // _MAX_ECHOES))].astype(np.float64)
+            kept = points[:: max(1, -(-len(points) // max_echoes))].astype(np.float64)
+            kept *= track.range_scale
             pings.append(np.full(len(kept), num_pings))
             echoes.append(kept)
             num_pings += 1
@@ -123,14 +154,15 @@ def _arranged(tracks: Sequence[Track]) -> _Problem:
     )
 
 
-def _bends(problem: _Problem, bend: FloatArray) -> FloatArray:
+def _bends(problem: _Problem, found: FloatArray) -> FloatArray:
     """Correction (K, 3) of each ping: a shift of its place, and a turn about it."""
+    bend = found[: 3 * problem.num_nodes].reshape(-1, 3)
     share = problem.share[:, None]
     return (1.0 - share) * bend[problem.node] + share * bend[problem.node + 1]
 
 
-def _prior(problem: _Problem) -> sp.csr_matrix:
-    """Square root of the information on the nodes, in order x, y, yaw of each."""
+def _prior(problem: _Problem, num_tracks: int, stretch_sigma: float) -> sp.csr_matrix:
+    """Square root of the information on the nodes, x, y, yaw of each, and on the stretches."""
     same = np.flatnonzero(problem.node_track[1:] == problem.node_track[:-1])
     ones = np.ones(len(same))
     places = (np.tile(np.arange(len(same)), 2), np.concatenate([same, same + 1]))
@@ -139,21 +171,25 @@ def _prior(problem: _Problem) -> sp.csr_matrix:
     )
     bends = sp.kron(differences, np.diag([1 / _BEND_SIGMA_M] * 2 + [1 / _BEND_SIGMA_RAD]))
     anchor = np.tile([1 / _ANCHOR_SIGMA_M] * 2 + [1 / _ANCHOR_SIGMA_RAD], problem.num_nodes)
-    return sp.vstack([bends, sp.diags(anchor / math.sqrt(problem.num_nodes))]).tocsr()
+    nodes = sp.vstack([bends, sp.diags(anchor / math.sqrt(problem.num_nodes))])
+    stretches = sp.identity(num_tracks) / stretch_sigma
+    return sp.block_diag([nodes, stretches]).tocsr()
 
 
 def _step(
     problem: _Problem,
-    bend: FloatArray,
+    found: FloatArray,
     prior: sp.csr_matrix,
     block_m: float,
     shift_m: float,
     noise_m: float,
     width_m: float,
 ) -> FloatArray:
-    """One Gauss-Newton step (M, 3) of all nodes."""
-    poses = problem.poses + _bends(problem, bend)
-    ping, (ex, ey) = problem.ping, problem.echo.T
+    """One Gauss-Newton step (3 M + T,): of all nodes, then of all tracks' stretches."""
+    poses = problem.poses + _bends(problem, found)
+    stretch = found[3 * problem.num_nodes :]
+    ping = problem.ping
+    ex, ey = problem.echo.T * (1.0 + stretch[problem.track[ping]])
     cos, sin = np.cos(poses[ping, 2]), np.sin(poses[ping, 2])
     arm = np.column_stack([cos * ex - sin * ey, sin * ex + cos * ey])
     points = poses[ping, :2] + arm
@@ -171,10 +207,12 @@ def _step(
     turn = n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]
     node, share = problem.node[point_ping], problem.share[point_ping]
     by_node = np.column_stack([n, turn])
-    columns = 3 * node[:, None] + np.arange(6)
-    values = np.column_stack([(1.0 - share)[:, None] * by_node, share[:, None] * by_node])
+    track = problem.track[point_ping]
+    columns = np.column_stack([3 * node[:, None] + np.arange(6), 3 * problem.num_nodes + track])
+    outward = (n * arm).sum(axis=1) / (1.0 + stretch[track])
+    values = np.column_stack([(1.0 - share)[:, None] * by_node, share[:, None] * by_node, outward])
     rows = np.repeat(np.arange(len(keep)), columns.shape[1])
-    shape = (len(keep), 3 * problem.num_nodes)
+    shape = (len(keep), len(found))
     jacobian = sp.csr_matrix((values.ravel(), (rows, columns.ravel())), shape)
     weighted = sp.diags(weight) @ jacobian
     members = sp.csr_matrix(
@@ -183,8 +221,8 @@ def _step(
     sums = members @ weighted
     inverse = sp.diags(1.0 / np.maximum(total, 1e-12))
     information = jacobian.T @ weighted - sums.T @ inverse @ sums + prior.T @ prior
-    gradient = weighted.T @ away + prior.T @ (prior @ bend.ravel())
-    return -np.asarray(spsolve(information.tocsc(), gradient)).reshape(-1, 3)
+    gradient = weighted.T @ away + prior.T @ (prior @ found)
+    return -np.asarray(spsolve(information.tocsc(), gradient))
 
 
 def _walls(
