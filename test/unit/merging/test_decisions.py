@@ -349,6 +349,9 @@ def test_what_a_person_confirms_is_not_set_aside(liar, is_growing):
     queue.decide(confirm(id_of(1, 2), id_of(2, 1)))
     assert SubmapState.SET_ASIDE not in {r.state for r in queue.submaps()}
     assert groups(queue) == [["auv_1", "auv_2", "auv_3"]]
+    if not is_growing:
+        answer_all(queue, KNOWING)
+        assert "auv_1 is in the map because of it, which contradicts" in remark_of(queue, 1)
 
 
 def fix(submap_id, T_earth_map, queue, point=(0.0, 0.0), yaw=False, off=SE2(), **rest):

@@ -25,7 +25,7 @@ from uw_dslam_ros2.core.pose_graph import (
 )
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.submap import SubmapId, Track, track_name
 
 __all__ = ["matches_by_hand", "remarks", "stated_pose"]
 
@@ -107,6 +107,7 @@ def remarks(
     plan: Plan,
     answers: Mapping[QueryKey, Answer],
     georeference: Georeference | str,
+    doubts: Mapping[Track, str],
 ) -> dict[int, str]:
     """What became of each decision, for people; empty where there is nothing to say."""
     told = {decision.number: "" for decision in log}
@@ -117,7 +118,7 @@ def remarks(
         if by := log.undone_by(number):
             told[number] = f"undone by {by}"
         elif decision.kind is DecisionKind.CONFIRM:
-            told[number] = _of_confirmed(decision, log, library, plan)
+            told[number] = _of_confirmed(decision, log, library, plan, doubts)
         elif decision.kind is DecisionKind.REGISTER:
             if decision not in log.windows:
                 told[number] = "replaced by a later decision"
@@ -176,7 +177,13 @@ def _window(library: Library, decision: Decision, groups: list[SubmapGroup]) -> 
     )
 
 
-def _of_confirmed(decision: Decision, log: DecisionLog, library: Library, plan: Plan) -> str:
+def _of_confirmed(
+    decision: Decision,
+    log: DecisionLog,
+    library: Library,
+    plan: Plan,
+    doubts: Mapping[Track, str],
+) -> str:
     if decision not in log.confirmed:
         return "replaced by a later decision"
     where = component_numbers(plan.components)
@@ -202,6 +209,10 @@ def _of_confirmed(decision: Decision, log: DecisionLog, library: Library, plan: 
     if against:
         matches = "match" if len(against) == 1 else "matches"
         parts.append(f"{len(against)} {matches} of the same runs contradict it and do not count")
+    parts += [
+        f"{track_name(track)} is in the map because of it, {doubts[track]}"
+        for track in sorted(tracks & doubts.keys())
+    ]
     return "; ".join(parts)
 
 

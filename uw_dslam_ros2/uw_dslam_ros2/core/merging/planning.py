@@ -34,6 +34,8 @@ class Planning:
         self._why: dict[Track, str] = {}
         self.aside: dict[SubmapId, str] = {}
         """What the last plan leaves out, and why."""
+        self.doubts: dict[Track, str] = {}
+        """Runs that would be set aside if no person wanted them in the map, and why."""
 
     def library(self, submaps: Mapping[SubmapId, StoredSubmap], decisions: DecisionLog) -> Library:
         """All submaps but those that their own odometry shows to be impossible."""
@@ -76,11 +78,14 @@ class Planning:
         wanted_tracks = {end.track for decision in library.confirmed for end in decision.pair}
         plan = plan_with(library)
         if not is_growing and not plan.wanted:
-            self._contradicting = []
+            self._contradicting, self.doubts = [], {}
             whole, sound = plan, library
             while len(self._contradicting) < len(tracks) and not plan.wanted:
                 track, why = self._unsound(sound, plan)
-                if track is None or track in wanted_tracks:
+                if track is None:
+                    break
+                if track in wanted_tracks:
+                    self.doubts[track] = why
                     break
                 self._contradicting.append(track)
                 self._why[track] = why

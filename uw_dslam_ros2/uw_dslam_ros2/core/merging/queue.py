@@ -205,7 +205,9 @@ class MapQueue:
         if not len(self._decisions):
             return []
         plan, found = self._plan(), self._georeference()
-        told = remarks(self._decisions, self._current_library(), plan, self._answers, found)
+        doubts = self._planning.doubts
+        library = self._current_library()
+        told = remarks(self._decisions, library, plan, self._answers, found, doubts)
         return [
             DecisionRecord(d, self._decisions.undone_by(d.number) is None, told[d.number])
             for d in self._decisions
