@@ -209,6 +209,7 @@ def test_bags_become_one_map_that_is_true(graph, mission, tmp_path):
     client.until(lambda: chain <= client.frames, "the frames")
     assert client.odometry[-1].header.frame_id == "auv_1/odom"
     assert client.submaps[-1].header.frame_id.startswith("auv_1/submap_")
+    client.until(lambda: client.maps, "the map")
     assert client.maps[-1].header.frame_id == "map"
     nodes = {*(f"{v}/sonar_mapper" for v in VEHICLES), "registration_server", "map_queue_manager"}
     client.until(lambda: nodes <= client.diagnosed, "diagnostics of every node")

@@ -121,7 +121,7 @@ def test_the_archive_holds_what_is_shown(source, tmp_path):
         ("/api/pairs/999", "registration is 999"),
         ("/api/pairs/1/walls.png", "layer is 'walls'"),
         ("/api/tiles/x/all/40/0/0.png", "zoom is 40"),
-        ("/api/pairs/1?rival=7", "rival is 7"),
+        ("/api/pairs/1?rival=999", "rival is 999"),
     ],
 )
 def test_wrong_questions_are_told(source, path, said):

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -257,7 +258,7 @@ class MapQueueManager(ManagedNode):
         self._keeper.save_if_due(self._queue)
         if self._is_changed and self._drawing.is_due():
             self._is_changed = False
-            with self._drawing.turn():
+            with self._drawing.turn() if self._queue.submaps() else nullcontext():
                 self._publish_map()
                 self._publish_status()
         elif now_s - self._status_s >= _STATUS_PERIOD_S:
