@@ -231,6 +231,14 @@ def test_uncertainty_closes_a_submap_too(recording):
     assert tight > 3
 
 
+def test_without_a_velocity_no_submap_of_a_few_pings_is_made(recording):
+    events = [event for event in recording[0] if event[0] != "velocity"]
+    seconds = (events[-1][1] - events[0][1]) * 1e-9
+    config = replace(CONFIG, estimator="dead_reckoning", submap=SubmapConfig(max_sigma_m=0.01))
+    _, submaps = run(config, events)
+    assert len({s.sequence for s in submaps}) <= 1 + seconds / 8.0
+
+
 def test_walls_are_where_they_are(recording, mapped):
     mapper, _ = mapped
     _, truth = recording

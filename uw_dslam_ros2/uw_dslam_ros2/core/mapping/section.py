@@ -24,6 +24,8 @@ FloatArray = NDArray[np.float64]
 Watch = Callable[[Detections, SE2], None]
 """Called with all that enters a grid, and its ``T_submap_sonar``."""
 
+_LEAST_S = 8.0
+"""Without a velocity everything is uncertain at once: a submap of a few pings joins nothing."""
 _MIN_MOTION_M, _MIN_TURN_RAD, _MIN_INTERVAL_S = 0.1, 0.02, 1.0
 """A ping enters the grid after this path length, turn or time, whichever comes first: pings of
 one place repeat one another's errors, and a vehicle at rest would be ever more sure of them.
@@ -158,10 +160,11 @@ class OpenSection:
         config: SubmapConfig = self._config.submap
         if self.num_pings < config.min_pings:
             return False
+        age_s = (stamp_ns - self._stamps_ns[0]) * 1e-9
         return (
             self._length_m >= config.max_length_m
-            or (stamp_ns - self._stamps_ns[0]) * 1e-9 >= config.max_duration_s
-            or sigma_m >= config.max_sigma_m
+            or age_s >= config.max_duration_s
+            or (sigma_m >= config.max_sigma_m and age_s >= _LEAST_S)
         )
 
     def close(self, T_odom_submap: SE2, drift: FloatArray) -> ClosedSection:
