@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
@@ -43,6 +44,9 @@ def records_of(
     first = 0 if is_pinned else 1
     number = component_numbers(components)
     tries = _num_tries(answers)
+    # The same for all submaps of a track, and there are many of them.
+    why_merged = functools.cache(lambda track: _merge_reason(track, anchor, plan, confirmed))
+    why_waiting = functools.cache(lambda track: _wait_reason(track, answers))
     records = []
     for submap_id in sorted(submaps):
         component = first + number[submap_id]
@@ -51,11 +55,13 @@ def records_of(
         elif submap_id in aside:
             state, reason = SubmapState.SET_ASIDE, aside[submap_id]
         elif component == 0:
-            state, reason = SubmapState.MERGED, _merge_reason(submap_id, anchor, plan, confirmed)
+            state, reason = SubmapState.MERGED, why_merged(submap_id.track)
+            if submap_id == anchor:
+                reason = "pins the global frame"
             if submap_id in undrawn:
                 reason = f"{reason}; {undrawn[submap_id]}"
         else:
-            state, reason = SubmapState.WAITING, _wait_reason(submap_id.track, answers)
+            state, reason = SubmapState.WAITING, why_waiting(submap_id.track)
         records.append(
             SubmapRecord(
                 submaps[submap_id].submap,
@@ -114,25 +120,23 @@ def constraints_of(plan: Plan, confirmed: Sequence[Edge]) -> list[Constraint]:
 
 
 def _merge_reason(
-    submap_id: SubmapId, anchor: SubmapId | None, plan: Plan, confirmed: Sequence[Edge]
+    track: Track, anchor: SubmapId | None, plan: Plan, confirmed: Sequence[Edge]
 ) -> str:
     assert anchor is not None
-    if submap_id == anchor:
-        return "pins the global frame"
-    if submap_id.track == anchor.track:
+    if track == anchor.track:
         return "odometry from the submap that pins the global frame"
     own = [
         constraint
         for constraint in plan.constraints
         if constraint.is_inlier
-        and submap_id.track in (constraint.edge.source.track, constraint.edge.target.track)
+        and track in (constraint.edge.source.track, constraint.edge.target.track)
     ]
     edges = [constraint.edge for constraint in own]
-    by_hand = [e for e in confirmed if submap_id.track in (e.source.track, e.target.track)]
+    by_hand = [e for e in confirmed if track in (e.source.track, e.target.track)]
     ends = {i for edge in edges or by_hand for i in (edge.source, edge.target)}
-    partners = {i.track for i in ends} - {submap_id.track}
-    names = sorted({t.vehicle_id for t in partners if t.vehicle_id != submap_id.vehicle_id})
-    if any(t.vehicle_id == submap_id.vehicle_id for t in partners):
+    partners = {i.track for i in ends} - {track}
+    names = sorted({t.vehicle_id for t in partners if t.vehicle_id != track.vehicle_id})
+    if any(t.vehicle_id == track.vehicle_id for t in partners):
         names.append("another run of its own")
     reason = f"registered with {', '.join(names)}"
     if by_hand and not own:
