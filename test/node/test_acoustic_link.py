@@ -12,6 +12,8 @@ from std_msgs.msg import Empty, UInt8MultiArray
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import ConfigError
+from uw_dslam_ros2.core.link import Layer
+from uw_dslam_ros2.core.link.transport.packets import Packet
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_to_msg
 from uw_dslam_ros2.ros.nodes.acoustic_link import AcousticLinkNode
@@ -40,11 +42,14 @@ def make_link(context, number, **settings):
 
 @pytest.fixture
 def fleet(ros_context, spinning):
-    """``with fleet(loss=0.2) as (until, send, got)``: two vehicles and the water between them."""
+    """``with fleet(loss=0.2) as (until, send, got)``: two vehicles and the water between them.
+
+    `fleet.links` are their nodes then; the second one keeps its `state` in a file.
+    """
     import contextlib
 
     @contextlib.contextmanager
-    def run(**channel):
+    def run(state="", **channel):
         water = make(
             ChannelNode,
             ros_context,
@@ -52,7 +57,10 @@ def fleet(ros_context, spinning):
             time_scale=2.0,
             **{f"channel__{name}": value for name, value in channel.items()},
         )
-        links = [make_link(ros_context, number) for number in (1, 2)]
+        run.links = links = [
+            make_link(ros_context, 1),
+            make_link(ros_context, 2, state=state),
+        ]
         probe = rclpy.create_node("probe", context=ros_context)
         outputs, got = {}, {1: {}, 2: {}}
         for number in (1, 2):
@@ -82,11 +90,12 @@ def test_each_vehicle_gets_the_others_submaps_and_its_own_as_they_have_it(fleet,
         for number in (1, 2):
             send(room_submap(f"auv_{number}", 0, T_odom_submap=SE2(1.0, number, 0.5)))
         until(lambda: all(len(known) == 2 for known in got.values()), "two submaps each")
+        until(lambda: all(s.revision == Layer.MEDIUM for k in got.values() for s in k.values()))
     for key in (("auv_1", 0), ("auv_2", 0)):
         mine, theirs = got[1][key], got[2][key]
         np.testing.assert_array_equal(mine.grid.values, theirs.grid.values)
         assert mine.T_odom_submap == theirs.T_odom_submap
-        assert mine.grid.spec.resolution_m == pytest.approx(0.3)
+        assert mine.grid.spec.resolution_m == pytest.approx(0.2)
 
 
 def test_a_link_goes_on_where_it_was_stopped(ros_context, spinning, tmp_path):
@@ -134,6 +143,45 @@ def test_noise_from_a_modem_is_counted(ros_context, spinning):
         until(lambda: output.get_subscription_count())
         output.publish(UInt8MultiArray(data=b"\x00" * 20))
         until(lambda: any(name.startswith("refused") for name in link._report()[2]))
+
+
+def test_hostile_packets_make_no_submap_and_are_told(fleet, rng):
+    """Sound checksums over anything, old packets again, and a liar who has no key."""
+    with fleet() as (until, send, got):
+        send(room_submap("auv_1", 0))
+        until(lambda: got[2], "a submap")
+        link = fleet.links[1]
+        probe = rclpy.create_node("liar", context=link.context)
+        output = probe.create_publisher(UInt8MultiArray, "/auv_2/modem/received", MODEM)
+        until(output.get_subscription_count)
+        for _ in range(20):  # not more than the queue holds
+            fields = [int(rng.integers(0, n)) for n in (4, 32, 1024, 64, 128)]
+            packet = Packet(*fields, rng.bytes(int(rng.integers(1, 58)))).pack(b"")
+            for data in (packet, packet[:-1], packet, bytes([packet[0] ^ 0xC0]) + packet[1:]):
+                output.publish(UInt8MultiArray(data=data))
+
+        def num_refused():
+            return sum(n for name, n in link._report()[2].items() if name.startswith("refused"))
+
+        until(lambda: num_refused() >= 40, "all that is damaged")
+        probe.destroy_node()
+    assert set(got[2]) == {("auv_1", 0)}
+
+
+def test_a_killed_link_has_all_that_it_received_and_asks_for_nothing_again(
+    ros_context, spinning, fleet, tmp_path
+):
+    state = str(tmp_path / "link.json")
+    with fleet(state=state) as (until, send, got):
+        send(room_submap("auv_1", 0))
+        until(lambda: got[2] and got[2]["auv_1", 0].revision == Layer.MEDIUM, "the submap")
+        before = fleet.links[1]._link.to_state()
+        until(lambda: fleet.links[1]._is_changed is False, "what was received on the disk")
+    again = make_link(ros_context, 2, state=state)
+    with spinning(again):
+        assert [s.submap_id for s in again._link.submaps()] == [("auv_1", 0, 0)]
+        assert again._link.to_state().received == before.received
+        assert again._link.is_complete
 
 
 @pytest.mark.parametrize(

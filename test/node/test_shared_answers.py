@@ -52,6 +52,7 @@ class Vehicle:
             servers=[f"{name}/server"],
             link=name,
             queue__anchor_vehicle="auv_1",
+            queue__resolution_m=0.1,
             publish_period_s=0.1,
             full_map_period_s=0.1,
         )

@@ -1,6 +1,6 @@
 """Links that talk over a simulated channel, for tests."""
 
-from uw_dslam_ros2.core.link import AcousticLink, LinkConfig
+from uw_dslam_ros2.core.link import AcousticLink, Layer, LinkConfig
 from uw_dslam_ros2.core.link.transport.channel import ChannelConfig, SharedChannel
 
 
@@ -49,4 +49,8 @@ class Talk:
         return self.now_s
 
     def all_know(self, num_submaps):
-        return all(len(got) == num_submaps for got in self.got.values())
+        """Whether everybody has so many submaps, in all layers that are sent unasked."""
+        return all(
+            len(got) == num_submaps and all(s.revision % 4 >= Layer.MEDIUM for s in got.values())
+            for got in self.got.values()
+        )

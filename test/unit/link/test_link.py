@@ -151,7 +151,7 @@ def test_what_was_overtaken_need_not_arrive():
         talk.run(talk.now_s + 6.0)
     talk.until_all_know(1, 300.0)
     talk.run(talk.now_s + 200.0)
-    assert talk.got[2][own_submap(1, 0).submap_id].revision == 4 * 4 + Layer.COARSE
+    assert talk.got[2][own_submap(1, 0).submap_id].revision == 4 * 4 + Layer.MEDIUM
     assert talk.links[2].is_complete
     assert talk.links[1].num_open(talk.now_s) == 0
 
@@ -159,14 +159,14 @@ def test_what_was_overtaken_need_not_arrive():
 def test_detail_comes_where_it_is_asked_for():
     talk = fleet(loss=0.2)
     talk.until_all_know(6, 300.0)
-    key = LayerKey.of(77, 1, Layer.MEDIUM)
+    key = LayerKey.of(77, 1, Layer.FINE)
     talk.links[2].ask(3, key)
     talk.run(talk.now_s + 120.0)
     asked = own_submap(3, 1).submap_id
     sizes = {n: got[asked].grid.spec.resolution_m for n, got in talk.got.items()}
-    assert sizes == pytest.approx({1: 0.2, 2: 0.2, 3: 0.2})  # all overhear it, the owner too
+    assert sizes == pytest.approx({1: 0.1, 2: 0.1, 3: 0.1})  # all overhear it, the owner too
     others = [s.grid.spec.resolution_m for i, s in talk.got[1].items() if i != asked]
-    assert others == pytest.approx([0.3] * 5)
+    assert others == pytest.approx([0.2] * 5)
     assert same_everywhere(talk)
 
 
@@ -240,7 +240,10 @@ def test_damage_is_counted_and_never_makes_a_wrong_submap(chance):
         num_damaged += way != 3
         for one in (bytes(damaged), data, data):
             found += link.receive(one, 1.0)
-    assert [content(submap) for submap in found] == [wanted]
+    clean = AcousticLink(LinkConfig(number=2), "auv_2")
+    honest = [content(submap) for data in packets for submap in clean.receive(data, 1.0)]
+    assert [content(submap) for submap in found] == honest
+    assert honest[-1] == wanted
     # One in 65536 passes the packet's checksum; the item's own has to catch that.
     assert sum(link.counts.refused.values()) >= num_damaged - 1
     assert link.counts.duplicates > 0

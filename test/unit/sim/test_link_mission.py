@@ -10,7 +10,8 @@ from uw_dslam_ros2.sim.link_mission import run_link
 
 def queue_of(events, fleet, is_growing):
     """A manager that gets submaps as they come, and has them registered meanwhile."""
-    queue = MapQueue(MapQueueConfig(anchor_vehicle="auv_1"))
+    # Else the map has the cells of the layer of its first submap that comes first.
+    queue = MapQueue(MapQueueConfig(anchor_vehicle="auv_1", resolution_m=0.5))
     matcher = KnowingMatcher(fleet)
     queue.is_growing = is_growing
     # What pins the frame is what comes first; the order of the others must not matter.
@@ -36,11 +37,25 @@ def test_all_who_have_received_the_same_have_the_same_map():
     assert all(record.component == 0 for record in queues[2].submaps())
 
 
+def test_half_the_mission_in_blackout_changes_nothing_in_the_end():
+    fleet = three_vehicles(num_submaps=3)
+    submaps = list(fleet.submaps.values())
+    begin_ns = min(int(s.trajectory_stamp_ns[0]) for s in submaps)
+    length_s = max((s.stamp_ns - begin_ns) * 1e-9 for s in submaps)
+    half = [(0.25 * length_s, 0.75 * length_s)]
+    maps = set()
+    for blackouts in ([], half):
+        run = run_link(submaps, ChannelConfig(loss=0.3), limit_s=600.0, blackouts=blackouts)
+        assert (run.channel.blacked_out > 0) == bool(blackouts)
+        maps |= {map_bytes(queue_of(events, fleet, False)) for events in run.known.values()}
+    assert len(maps) == 1
+
+
 def test_detail_comes_for_what_is_asked():
     fleet = three_vehicles(num_submaps=2)
     details = {("auv_2", 0, 1)}
     run = run_link(list(fleet.submaps.values()), ChannelConfig(), limit_s=600.0, details=details)
-    wanted = {i: 4 * s.revision + Layer.COARSE for i, s in fleet.submaps.items()}
+    wanted = {i: 4 * s.revision + Layer.MEDIUM for i, s in fleet.submaps.items()}
     wanted[next(iter(details))] = Layer.FINE
     done_s = run.complete_s(wanted)
     assert done_s is not None

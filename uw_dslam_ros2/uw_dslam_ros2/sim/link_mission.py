@@ -61,7 +61,8 @@ def run_link(
     blackouts
         Times (begin, end) from the mission's beginning in which nothing arrives.
     details
-        Submaps whose cells of 0.1 m the first vehicle asks for as soon as it has the coarse ones.
+        Submaps whose walls in cells of 0.1 m the first vehicle asks for as soon as it has coarse
+        ones.
     config
         Of the links; the number and the packets' size are set here.
     """
@@ -77,7 +78,7 @@ def run_link(
     pending = sorted(((s.stamp_ns - begin_ns) * 1e-9, s.submap_id, s) for s in submaps)
     run = LinkRun(pending[-1][0], {name: [] for name in names})
     asked: set[SubmapId] = set()
-    layers = {s.submap_id: Layer.FINE if s.submap_id in details else Layer.COARSE for s in submaps}
+    layers = {s.submap_id: Layer.FINE if s.submap_id in details else Layer.MEDIUM for s in submaps}
     wanted = {s.submap_id: 4 * s.revision + layers[s.submap_id] for s in submaps}
     turns = {number: water.next_turn(number, 0.0) for number in links}
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,12 @@ from uw_dslam_ros2.sim.link_mission import LinkRun, run_link
 __all__ = ["add_arguments", "run"]
 
 _LIMIT_S = 3600.0
+_CELLS = Layer.COARSE, Layer.MEDIUM, Layer.FINE
 _WAYS = {
     "full grids": None,
     "0.3 m": Layer.COARSE,
-    "0.2 m": Layer.MEDIUM,
-    "0.3 m, 0.1 m where matched": Layer.FINE,
+    "0.3 m, walls of 0.2 m": Layer.MEDIUM,
+    "0.3 m, walls of 0.1 m where joined": Layer.FINE,
 }
 _CLOUD_BYTES, _DESCRIPTOR_BYTES = 9000 // 8, 16
 _SHARED_RATE = 1500.0  # while a modem sends; 1000 bit/s with the pauses of 64-byte packets
@@ -66,18 +67,15 @@ def run(args: argparse.Namespace) -> int:
         found, details = ([], set()) if args.no_merging else _merged_rows(mission)
         merged += found
         for name, (channel, blackouts) in _channels(args.loss, mission.submaps).items():
-            for text, wanted in (("", set()), (", detail", details)):
-                if text and not wanted:
-                    continue
-                played = run_link(
-                    mission.submaps,
-                    dataclasses.replace(channel, seed=seed),
-                    limit_s=_LIMIT_S,
-                    blackouts=blackouts,
-                    details=wanted,
-                )
-                runs.setdefault(name + text, played)
-                rows.append(_row(mission, name + text, played, wanted))
+            played = run_link(
+                mission.submaps,
+                dataclasses.replace(channel, seed=seed),
+                limit_s=_LIMIT_S,
+                blackouts=blackouts,
+                details=details,
+            )
+            runs.setdefault(name, played)
+            rows.append(_row(mission, name, played, details))
     write_csv(args.out / "link.csv", rows)
     write_csv(args.out / "sizes.csv", sizes)
     _draw_known(runs, args.out / "link.png")
@@ -115,14 +113,23 @@ def _sizes(mission: str, submap: Submap) -> dict[str, Any]:
     }
 
 
+def _after_s(
+    played: LinkRun, submaps: Sequence[Submap], ids: Collection[SubmapId], layer: Layer
+) -> float | str:
+    """How long after the last ping everybody had these submaps down to a layer; "": never."""
+    wanted = {s.submap_id: 4 * s.revision + layer for s in submaps if s.submap_id in ids}
+    done_s = played.complete_s(wanted) if wanted else None
+    return "" if done_s is None else round(done_s - played.end_s, 1)
+
+
 def _row(
     mission: FleetMission, name: str, played: LinkRun, details: set[SubmapId]
 ) -> dict[str, Any]:
-    layers = {s.submap_id: Layer.COARSE for s in mission.submaps} | dict.fromkeys(
-        details, Layer.FINE
-    )
-    wanted = {s.submap_id: 4 * s.revision + layers[s.submap_id] for s in mission.submaps}
-    done_s = played.complete_s(wanted)
+    every = {submap.submap_id for submap in mission.submaps}
+    after_s = {
+        layer: _after_s(played, mission.submaps, every if layer < Layer.FINE else details, layer)
+        for layer in _CELLS
+    }
     sent: dict[str, int] = {}
     for counts in played.counts.values():
         for label, num in counts.sent_bytes.items():
@@ -131,7 +138,7 @@ def _row(
         "mission": mission.name,
         "channel": name,
         "submaps": len(mission.submaps),
-        "complete_s": "" if done_s is None else round(done_s - played.end_s, 1),
+        **{f"{layer.name.lower()}_s": at_s for layer, at_s in after_s.items()},
         "kB": round(sum(sent.values()) / 1000, 2),
         "status_kB": round(sent.get("status", 0) / 1000, 2),
         "packets": played.channel.sent,
@@ -146,20 +153,20 @@ def _row(
 def _merged_rows(mission: FleetMission) -> tuple[list[dict[str, Any]], set[SubmapId]]:
     """The map of full grids beside that of each layer, for everybody who has it all.
 
-    Also which submaps hold the matches of the coarse cells: whose detail is worth asking for.
+    Also the submaps of vehicles that are joined: whose detail is worth asking for.
     """
     found: list[dict[str, Any]] = []
     details: set[SubmapId] = set()
     for name, layer in _WAYS.items():
         crossed = []
         for submap in mission.submaps:
-            is_coarse = layer is Layer.FINE and submap.submap_id not in details
-            finest = Layer.COARSE if is_coarse else layer
+            is_alone = layer is Layer.FINE and submap.submap_id not in details
+            finest = Layer.MEDIUM if is_alone else layer
             crossed.append((submap, 0) if finest is None else _crossed(submap, finest))
         sent = FleetMission(mission.name, tuple(pair[0] for pair in crossed), mission.truth)
-        placing, matched = merged_largest(sent)
-        if layer is Layer.COARSE:
-            details = matched
+        placing, _ = merged_largest(sent)
+        if layer is Layer.MEDIUM and len({i.vehicle_id for i in placing}) > 1:
+            details = set(placing)
         num_bytes = sum(pair[1] for pair in crossed)
         found.append(
             {
@@ -224,12 +231,19 @@ def _report(rows: Sequence[Mapping[str, Any]]) -> None:
     table = []
     for name in dict.fromkeys(row["channel"] for row in rows):
         own = [row for row in rows if row["channel"] == name]
-        done = [row["complete_s"] for row in own if row["complete_s"] != ""]
+        times = [
+            [row[f"{layer.name.lower()}_s"] for row in own if row[f"{layer.name.lower()}_s"] != ""]
+            for layer in _CELLS
+        ]
         table.append(
             [
                 name,
-                f"{len(done)} of {len(own)}",
-                f"{np.median(done):.0f}, {max(done):.0f}" if done else "",
+                *(
+                    f"{np.median(done):.0f}, {max(done):.0f} ({len(done)} of {len(own)})"
+                    if done
+                    else ""
+                    for done in times
+                ),
                 f"{np.median([row['kB'] for row in own]):.1f}",
                 f"{np.median([row['packets'] for row in own]):.0f}",
                 f"{np.median([row['repairs'] for row in own]):.0f}",
@@ -238,8 +252,8 @@ def _report(rows: Sequence[Mapping[str, Any]]) -> None:
         )
     num = np.median([row["submaps"] for row in rows])
     print_table(
-        ["channel", "all have all", "s after the last ping (median, most)", "kB", "packets",
-         "repairs", "duplicates"],
+        ["channel", "cells of 0.3 m: s after the last ping, median, most", "walls of 0.2 m",
+         "of 0.1 m", "kB", "packets", "repairs", "duplicates"],
         table,
     )  # fmt: skip
     draco = num * (_DESCRIPTOR_BYTES + _CLOUD_BYTES) / 1000

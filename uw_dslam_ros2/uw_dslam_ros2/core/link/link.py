@@ -47,6 +47,7 @@ _LAYER_RANKS = {
     Layer.FINE: 3.0,
 }
 """The lower, the sooner. Walls of 0.2 m of all come before those of 0.1 m of any."""
+_UNASKED = Layer.MEDIUM  # the finest layer that is sent of every submap
 _PACKETS_PER_STATUS = 12  # between two reports while there is something else to send
 _HASTE = 0.3  # who has nothing else to say reports that much sooner
 _MAX_ASKS = 4
@@ -95,9 +96,11 @@ class AcousticLink:
             raise InvalidInputError(
                 f"submap of {submap.vehicle_id!r} on the link of {self._name!r}"
             )
-        layers = encode_submap(submap, self._key, Layer.COARSE)
+        layers = encode_submap(submap, self._key, _UNASKED)
         self._sources[submap.run_id & 0xFFFF, submap.sequence] = submap
-        for layer in (Layer.OUTLINE, Layer.COARSE):
+        for layer in Layer:
+            if layer > _UNASKED:
+                break
             self._say(LayerKey.of(submap.run_id, submap.sequence, layer), layers[layer])
         self._rank_cells()
         return self._improved(self._config.number)
@@ -194,7 +197,7 @@ class AcousticLink:
         if key in self._own or submap is None:
             return
         for layer, data in encode_submap(submap, self._key, key.layer).items():
-            if layer > Layer.COARSE:
+            if layer > _UNASKED:
                 self._say(LayerKey(key.run, key.sequence, layer), data)
 
     # --- packets out -------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Empty, UInt8MultiArray
-from uw_dslam_msgs.msg import Constraint, MergeStatus
+from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
@@ -163,16 +163,16 @@ class AcousticLinkNode(Node):
             self._modem.publish(UInt8MultiArray(data=packet))
 
     def _on_status(self, msg: MergeStatus) -> None:
-        """Ask for the detail of submaps that hold the vehicles together."""
-        for constraint in msg.constraints:
-            if constraint.kind != Constraint.REGISTRATION or not constraint.is_inlier:
-                continue
-            self._ask(
-                constraint.source_vehicle_id, constraint.source_run_id, constraint.source_sequence
-            )
-            self._ask(
-                constraint.target_vehicle_id, constraint.target_run_id, constraint.target_sequence
-            )
+        """Ask for the detail of all submaps of vehicles that are joined.
+
+        Of all, because maps of several submaps are matched, on the cells of one of them.
+        """
+        members: dict[int, set[str]] = {}
+        for info in msg.submaps:
+            members.setdefault(info.component, set()).add(info.vehicle_id)
+        for info in msg.submaps:
+            if len(members[info.component]) > 1:
+                self._ask(info.vehicle_id, info.run_id, info.sequence)
 
     def _ask(self, vehicle_id: str, run_id: int, sequence: int) -> None:
         key = LayerKey.of(run_id, sequence, Layer.FINE)

@@ -196,7 +196,7 @@ class AcousticLinkConfig(Config):
     )
     is_detail_asked: bool = setting(
         True,
-        doc="ask for cells of 0.1 m of submaps by which the manager has joined vehicles",
+        doc="ask for walls in cells of 0.1 m of the submaps of vehicles that are joined",
     )
     time_scale: float = setting(
         1.0, 0.01, 1000.0, "seconds that pass in a second: as that of the simulated channel"
