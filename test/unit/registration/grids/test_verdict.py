@@ -15,6 +15,7 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MatchEvidence,
     PoseEvidence,
     probability_of,
+    rival_probability,
 )
 from uw_dslam_ros2.core.registration.grids.judging.verdict import (
     _RULES,
@@ -62,6 +63,12 @@ def random_case(rng):
         upper_bound=0.9,
     )  # fmt: skip
     return evidence, config, proof
+
+
+def test_a_rival_that_large_maps_deny_beyond_doubt_has_no_probability():
+    best = PoseEvidence(replace(AGREEMENT, num_walls=400_000), 1.0, 12.0)
+    rival = PoseEvidence(replace(AGREEMENT, num_walls=400_000, agreement=0.05), 1.0, 12.0)
+    assert rival_probability(replace(GOOD, best=best, rivals=(rival,))) == pytest.approx(0.0)
 
 
 # What a sentence begins with, what it measures, the limit, and on which side of it it must lie.

@@ -70,6 +70,7 @@ ENOUGH_DETAIL = 600.0
 # Wall cells next to each other agree or not together: so many count as one (design effect, the
 # scatter of sums over squares against that of independent cells: 2.5 to 6 in noisy maps).
 _CELLS_PER_SAMPLE = 5.0
+_MOST_HOPELESS = 700.0
 _LEAST_VARIANCE = 0.005  # of one sample, as if one in two hundred disagreed
 _LIKE_DETAIL = 0.02  # how much of the best pose's detail it shows at least, sharing less area
 
@@ -180,7 +181,8 @@ def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -
 
 
 def _share(logit: float) -> float:
-    return 1.0 / (1.0 + math.exp(-logit))
+    """Probability of a logit; what is hopeless has one beyond the reach of an exponential."""
+    return 1.0 / (1.0 + math.exp(min(-logit, _MOST_HOPELESS)))
 
 
 def _lead(best: Agreement, rival: Agreement) -> float:
