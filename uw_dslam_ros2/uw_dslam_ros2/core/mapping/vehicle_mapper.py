@@ -417,7 +417,7 @@ class VehicleMapper:
         T_submap_base, covariance = self._navigation.relative_at(stamp_ns)
         # At the submap's own start the covariance is zero, which may come out as a trace below it.
         sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
-        if self._open.should_close(stamp_ns, sigma_m):
+        if self._open.should_close(stamp_ns, sigma_m, self._velocity_ns is None):
             issued = self._close(covariance)
             self._begin(stamp_ns, T_submap_base, covariance)
             T_submap_base = SE2()
