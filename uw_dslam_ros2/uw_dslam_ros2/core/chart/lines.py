@@ -90,7 +90,7 @@ def trace_walls(
             f"last_seen_ns has shape {last_seen_ns.shape}, expected the map's "
             f"{occupancy.values.shape}"
         )
-    ages = np.zeros(occupancy.values.shape, np.int64) if last_seen_ns is None else last_seen_ns
+    ages = last_seen_ns
     is_wall = occupancy.values > _WALL_PERCENT
     gap_cells = gap_m / spec.resolution_m
     groups = connected_cells(is_wall, gap_cells)
@@ -99,14 +99,21 @@ def trace_walls(
         side_m = float((np.ptp(cells, axis=0).max() + 1) * spec.resolution_m)
         if side_m <= pier_m:
             ((x, y),) = spec.centers_of(cells.mean(axis=0)[None])
-            piers.append(Pier(float(x), float(y), side_m, _latest(ages[tuple(cells.T)])))
+            piers.append(
+                Pier(
+                    float(x),
+                    float(y),
+                    side_m,
+                    None if ages is None else _latest(ages[tuple(cells.T)]),
+                )
+            )
             is_line[tuple(cells.T)] = False
     runs = skeleton_runs(is_line, gap_cells)
     return list(_walls(occupancy, is_line, runs, ages)), piers
 
 
 def _walls(
-    occupancy: OccupancyMap, is_line: BoolArray, runs: list[IntArray], ages: IntArray
+    occupancy: OccupancyMap, is_line: BoolArray, runs: list[IntArray], ages: IntArray | None
 ) -> Iterator[Wall]:
     padded = np.pad(is_line, _AROUND_CELLS)
     areas, latest = _nearest(is_line, runs, ages)
@@ -151,23 +158,20 @@ def _across(run: IntArray, padded: BoolArray) -> FloatArray:
 
 
 def _nearest(
-    is_line: BoolArray, runs: list[IntArray], ages: IntArray
+    is_line: BoolArray, runs: list[IntArray], ages: IntArray | None
 ) -> tuple[IntArray, IntArray]:
     """How many wall cells lie nearest to each run, and when the last of them was seen."""
+    from scipy.spatial import cKDTree  # not every program that has charts draws lines
+
     areas, latest = np.zeros(len(runs), np.int64), np.zeros(len(runs), np.int64)
     if not runs:
         return areas, latest
-    owner = np.full(is_line.shape, -1, np.int64)
-    for number, run in enumerate(runs):
-        owner[tuple(run.T)] = number
-    _, labels = cv2.distanceTransformWithLabels(
-        (owner < 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    of_label = np.zeros(labels.max() + 1, np.int64)
-    of_label[labels[owner >= 0]] = owner[owner >= 0]
-    nearest = of_label[labels[is_line]]
+    cells = np.argwhere(is_line)
+    owner = np.repeat(np.arange(len(runs)), [len(run) for run in runs])
+    nearest = owner[cKDTree(np.concatenate(runs)).query(cells)[1]]
     np.add.at(areas, nearest, 1)
-    np.maximum.at(latest, nearest, ages[is_line])
+    if ages is not None:
+        np.maximum.at(latest, nearest, ages[tuple(cells.T)])
     return areas, latest
 
 
