@@ -90,26 +90,18 @@ def trace_walls(
             f"last_seen_ns has shape {last_seen_ns.shape}, expected the map's "
             f"{occupancy.values.shape}"
         )
-    ages = last_seen_ns
     is_wall = occupancy.values > _WALL_PERCENT
     gap_cells = gap_m / spec.resolution_m
-    groups = connected_cells(is_wall, gap_cells)
     piers, is_line = [], is_wall.copy()
-    for cells in groups:
+    for cells in connected_cells(is_wall, gap_cells):
         side_m = float((np.ptp(cells, axis=0).max() + 1) * spec.resolution_m)
         if side_m <= pier_m:
             ((x, y),) = spec.centers_of(cells.mean(axis=0)[None])
-            piers.append(
-                Pier(
-                    float(x),
-                    float(y),
-                    side_m,
-                    None if ages is None else _latest(ages[tuple(cells.T)]),
-                )
-            )
+            seen_ns = 0 if last_seen_ns is None else int(last_seen_ns[tuple(cells.T)].max())
+            piers.append(Pier(float(x), float(y), side_m, seen_ns or None))
             is_line[tuple(cells.T)] = False
     runs = skeleton_runs(is_line, gap_cells)
-    return list(_walls(occupancy, is_line, runs, ages)), piers
+    return list(_walls(occupancy, is_line, runs, last_seen_ns)), piers
 
 
 def _walls(
@@ -163,17 +155,12 @@ def _nearest(
     """How many wall cells lie nearest to each run, and when the last of them was seen."""
     from scipy.spatial import cKDTree  # not every program that has charts draws lines
 
-    areas, latest = np.zeros(len(runs), np.int64), np.zeros(len(runs), np.int64)
+    latest = np.zeros(len(runs), np.int64)
     if not runs:
-        return areas, latest
+        return latest, latest
     cells = np.argwhere(is_line)
     owner = np.repeat(np.arange(len(runs)), [len(run) for run in runs])
     nearest = owner[cKDTree(np.concatenate(runs)).query(cells)[1]]
-    np.add.at(areas, nearest, 1)
     if ages is not None:
         np.maximum.at(latest, nearest, ages[tuple(cells.T)])
-    return areas, latest
-
-
-def _latest(stamps_ns: IntArray) -> int | None:
-    return int(stamps_ns.max()) or None
+    return np.bincount(nearest, minlength=len(runs)), latest
