@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
@@ -14,7 +15,7 @@ from uw_dslam_ros2.core.merging.checks.contradictions import contradicting_map
 from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track, implausible_submaps
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.decisions import DecisionLog
-from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
@@ -70,16 +71,20 @@ class Planning:
         is_growing
             Whether more submaps are expected soon.
         """
-
-        def plan_with(sound: Library) -> Plan:
-            return self._plan_with(sound, tracks, answers, standing, anchor, is_growing=is_growing)
-
+        plan_with = functools.partial(
+            self._plan_with,
+            tracks=tracks,
+            answers=answers,
+            standing=standing,
+            anchor=anchor,
+            is_growing=is_growing,
+        )
         # A person wants them in the map.
         wanted_tracks = {end.track for decision in library.confirmed for end in decision.pair}
         plan = plan_with(library)
         if not is_growing and not plan.wanted:
             self._contradicting, self.doubts = [], {}
-            whole, sound = plan, library
+            sound = library
             while len(self._contradicting) < len(tracks) and not plan.wanted:
                 track, why = self._unsound(sound, plan)
                 if track is None:
@@ -91,18 +96,13 @@ class Planning:
                 self._why[track] = why
                 sound = library.without(self._contradicting)
                 plan = plan_with(sound)
-            plan = dataclasses.replace(plan, wanted=[*whole.wanted, *plan.wanted])
         elif held := [
             track
             for track in self._contradicting
             if track in tracks and track not in wanted_tracks
         ]:
             # While questions are open, what was judged before goes on to hold.
-            wanted = plan.wanted
-            plan = plan_with(library.without(held))
-            known = {query.key for query in wanted}
-            wanted += [query for query in plan.wanted if query.key not in known]
-            plan = dataclasses.replace(plan, wanted=wanted)
+            plan = _asking_first(plan.wanted, plan_with(library.without(held)))
         self.aside = self._implausible | {
             i: f"set aside with its whole run, {self._why[i.track]}"
             for i in library.submaps
@@ -141,7 +141,11 @@ class Planning:
             return make_pairwise_plan(library, known, answers, anchor, is_growing=is_growing)
         library.by_hand, wanted = matches_by_hand(library, answers, is_growing=is_growing)
         make = make_growing_plan if is_growing else make_plan
-        plan = make(library, answers, standing, anchor, self._config)
-        first = {query.key for query in wanted}
-        wanted += [query for query in plan.wanted if query.key not in first]
-        return dataclasses.replace(plan, wanted=wanted)
+        return _asking_first(wanted, make(library, answers, standing, anchor, self._config))
+
+
+def _asking_first(questions: Sequence[Query], plan: Plan) -> Plan:
+    """A plan that asks something else before its own questions, each of them once."""
+    known = {query.key for query in questions}
+    own = [query for query in plan.wanted if query.key not in known]
+    return dataclasses.replace(plan, wanted=[*questions, *own])
