@@ -66,6 +66,12 @@ class GridSpec:
         """``(num_rows, num_cols)``."""
         return self.num_rows, self.num_cols
 
+    @property
+    def reach_m(self) -> float:
+        """No cell lies farther from the frame's origin."""
+        origin = self.T_frame_grid
+        return math.hypot(origin.x, origin.y) + self.resolution_m * math.hypot(*self.shape)
+
     def cells_of(self, points: ArrayLike) -> NDArray[np.int64]:
         """Cells [row, col] (N, 2) that hold points (N, 2) [x, y] [m]; may lie outside the grid."""
         local = self.T_frame_grid.inverse().apply(points) / self.resolution_m

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from uw_dslam_ros2.core.submap import SubmapId
 
 FloatArray = NDArray[np.float64]
 
-__all__ = ["GlobalMap", "pinned_lattice", "snap_pose", "undrawable"]
+__all__ = ["GlobalMap", "Piece", "draw_pieces", "pinned_lattice", "snap_pose", "undrawable"]
 
 
 class GlobalMap:
@@ -32,15 +33,13 @@ class GlobalMap:
         self, submaps: Mapping[SubmapId, StoredSubmap], T_map_submap: Mapping[SubmapId, SE2]
     ) -> None:
         """Make it show exactly these submaps; what lies as before is left alone."""
-        mosaic = self._mosaic
-        for key in [key for key in mosaic.keys() if key not in T_map_submap]:  # noqa: SIM118
-            mosaic.remove(key)
+        pieces = {}
         for submap_id, motion in T_map_submap.items():
             stored = submaps[submap_id]
-            snapped = snap_pose(motion, mosaic.lattice.resolution_m, stored.radius_m)
-            version = (stored.digest, snapped)
-            if mosaic.version_of(submap_id) != version:
-                mosaic.put(submap_id, version, stored.submap.grid, snapped)
+            pieces[submap_id] = Piece(
+                stored.submap.grid, motion, version=stored.digest, radius_m=stored.radius_m
+            )
+        draw_pieces(self._mosaic, pieces)
 
     def occupancy(self) -> OccupancyMap | None:
         """The fused map; None without evidence."""
@@ -60,6 +59,28 @@ class GlobalMap:
         owners, sets = self._mosaic.contributor_sets()
         named = tuple(tuple(sorted(SubmapId(*i) for i in keys)) for keys in sets)  # type: ignore[misc]
         return MapProvenance(self._mosaic.spec_of(window), contradictions, owners, named)
+
+
+class Piece(NamedTuple):
+    """A grid to be drawn, and where it lies in the mosaic's frame."""
+
+    grid: OccupancyMap
+    T_mosaic_grid: SE2
+    version: Hashable
+    """Of the grid's content."""
+    radius_m: float
+    """No known cell lies farther from the grid's frame."""
+
+
+def draw_pieces(mosaic: Mosaic, pieces: Mapping[SubmapId, Piece]) -> None:
+    """Make a mosaic show exactly these; what lies as before is left alone."""
+    for key in [key for key in mosaic.keys() if key not in pieces]:  # noqa: SIM118
+        mosaic.remove(key)
+    for submap_id, piece in pieces.items():
+        snapped = snap_pose(piece.T_mosaic_grid, mosaic.lattice.resolution_m, piece.radius_m)
+        version = (piece.version, snapped)
+        if mosaic.version_of(submap_id) != version:
+            mosaic.put(submap_id, version, piece.grid, snapped)
 
 
 def undrawable(
@@ -105,11 +126,9 @@ def _surely_fits(
     """Whether circles around all grids lie in a map that can be made: the usual case, quickly."""
     x, y, reach = [], [], []
     for submap_id, motion in T_map_submap.items():
-        spec = submaps[submap_id].submap.grid.spec
-        origin = spec.T_frame_grid
         x.append(motion.x)
         y.append(motion.y)
-        reach.append(math.hypot(origin.x, origin.y) + spec.resolution_m * math.hypot(*spec.shape))
+        reach.append(submaps[submap_id].submap.grid.spec.reach_m)
     if not reach:
         return True
     side_m = max(float(np.ptp(x)), float(np.ptp(y))) + 2.0 * max(reach)

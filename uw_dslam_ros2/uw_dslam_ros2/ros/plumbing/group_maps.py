@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 
@@ -10,10 +9,9 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from uw_dslam_ros2.core.grid import GridSpec
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MAX_MAP_SIDE
-from uw_dslam_ros2.core.merging.global_map import pinned_lattice, snap_pose
+from uw_dslam_ros2.core.merging.global_map import Piece, draw_pieces, pinned_lattice
 from uw_dslam_ros2.core.mosaic import Mosaic
 from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg, stamp_to_msg
 from uw_dslam_ros2.ros.convert.merging import group_frame_ids
@@ -68,17 +66,16 @@ class GroupMaps:
         mosaic = self._drawn.get(frame_id)
         if mosaic is None or mosaic.lattice != lattice:
             mosaic = self._drawn[frame_id] = Mosaic(lattice)
-        members = {record.submap.submap_id for record in group}
-        for key in [key for key in mosaic.keys() if key not in members]:  # noqa: SIM118
-            mosaic.remove(key)
+        pieces = {}
         for record in group:
             submap = record.submap
-            pose = snap_pose(
-                record.T_component_submap, lattice.resolution_m, _reach_m(submap.grid.spec)
+            pieces[submap.submap_id] = Piece(
+                submap.grid,
+                record.T_component_submap,
+                version=submap.revision,
+                radius_m=submap.grid.spec.reach_m,
             )
-            version = (submap.revision, pose)
-            if mosaic.version_of(submap.submap_id) != version:
-                mosaic.put(submap.submap_id, version, submap.grid, pose)
+        draw_pieces(mosaic, pieces)
         return mosaic
 
     def _send(self, frame_id: str, msg: OccupancyGrid) -> None:
@@ -87,12 +84,6 @@ class GroupMaps:
             self._publishers[frame_id] = self._node.create_publisher(OccupancyGrid, topic, LATCHED)
             self._node.get_logger().info(f"the map of a group that is not joined: {topic}")
         self._publishers[frame_id].publish(msg)
-
-
-def _reach_m(spec: GridSpec) -> float:
-    """No cell of a grid lies further from its frame's origin."""
-    origin = spec.T_frame_grid
-    return math.hypot(origin.x, origin.y) + spec.resolution_m * math.hypot(*spec.shape)
 
 
 def _empty(frame_id: str, stamp_ns: int) -> OccupancyGrid:
