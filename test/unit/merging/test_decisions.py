@@ -391,7 +391,9 @@ def test_a_fix_that_the_others_contradict_is_told():
     for submap_id in (id_of(1, 0), id_of(1, 3), id_of(2, 0), id_of(3, 2)):
         queue.decide(fix(submap_id, T_earth_map, queue))
     queue.decide(fix(id_of(3, 0), T_earth_map, queue, off=SE2(20.0, 0.0, 0.0)))
-    assert remark_of(queue, 5).startswith("the other fixes contradict it")
+    assert remark_of(queue, 5).startswith("set aside, for the other fixes or the map contradict")
+    assert "20.00 m off" in remark_of(queue, 5)
+    assert queue.georeference().T_earth_map.distance_to(T_earth_map)[0] < 1e-3
     queue.decide(
         dataclasses.replace(fix(id_of(3, 0), T_earth_map, queue), earth_frame="EPSG:32633")
     )

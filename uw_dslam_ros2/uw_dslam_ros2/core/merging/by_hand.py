@@ -29,8 +29,6 @@ from uw_dslam_ros2.core.submap import SubmapId, Track, track_name
 
 __all__ = ["matches_by_hand", "remarks", "stated_pose"]
 
-_MANY_SIGMAS = 3.0
-
 
 def matches_by_hand(
     library: Library, answers: Mapping[QueryKey, Answer], *, is_growing: bool
@@ -226,9 +224,11 @@ def _why_idle(decision: Decision, library: Library) -> str:
 def _of_fix(decision: Decision, georeference: Georeference | str) -> str:
     if isinstance(georeference, str):
         return georeference
-    if decision.number not in georeference.metres_off:
+    fits = [fit for fit in georeference.fits if fit.fix.number == decision.number]
+    if not fits:
         return "its submap is not in the map"
-    metres = georeference.metres_off[decision.number]
-    sigmas = georeference.sigmas_off[decision.number]
-    text = f"{metres:.2f} m off, {sigmas:.1f} of its standard deviations"
-    return text if sigmas <= _MANY_SIGMAS else f"the other fixes contradict it: {text}"
+    (fit,) = fits
+    text = f"{fit.metres_off:.2f} m off, {fit.sigmas_off:.1f} of its standard deviations"
+    if fit.is_used:
+        return text
+    return f"set aside, for the other fixes or the map contradict it: {text}"

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.merging.georeference import Fix
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
@@ -169,6 +170,13 @@ class Decision:
         variances = np.array([self.sigma_m, self.sigma_m, self.sigma_rad]) ** 2
         return Edge(*self.pair, self.T_target_source, np.diag(variances))
 
+    def fix(self) -> Fix:
+        """What a FIX says."""
+        assert self.source is not None
+        assert self.place is not None
+        where = self.point, self.place, self.sigma_m, self.sigma_rad
+        return Fix(self.source, *where, self.earth_frame, self.number)
+
 
 @dataclass(frozen=True, slots=True)
 class DecisionRecord:
@@ -210,7 +218,7 @@ class DecisionLog:
         """The same of REGISTER."""
         pins = self.in_force(DecisionKind.PIN)
         self.pin = pins[-1].source if pins else None
-        self.fixes = self.in_force(DecisionKind.FIX)
+        self.fixes = [decision.fix() for decision in self.in_force(DecisionKind.FIX)]
 
     def __iter__(self) -> Iterator[Decision]:
         return iter(self._all)

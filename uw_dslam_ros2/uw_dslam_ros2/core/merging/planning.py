@@ -15,10 +15,13 @@ from uw_dslam_ros2.core.merging.checks.contradictions import contradicting_map
 from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track, implausible_submaps
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.decisions import DecisionLog
+from uw_dslam_ros2.core.merging.georeference import Fix, Georeference, pulled_by_fixes
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
+from uw_dslam_ros2.core.merging.graph.components import Component
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
+from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["Planning"]
@@ -55,10 +58,11 @@ class Planning:
         answers: Mapping[QueryKey, Answer],
         standing: AbstractSet[QueryKey],
         anchor: SubmapId | None,
+        fixes: Sequence[Fix] = (),
         *,
         is_growing: bool,
     ) -> Plan:
-        """A plan without the runs that others agree better without.
+        """A plan without the runs that others agree better without, pulled by fixes.
 
         Parameters
         ----------
@@ -68,6 +72,9 @@ class Planning:
             In order of first arrival.
         answers, standing, anchor
             See `make_plan`.
+        fixes
+            They pull what has been settled without them: what is asked, and believed, of matches
+            does not depend on them.
         is_growing
             Whether more submaps are expected soon.
         """
@@ -108,7 +115,29 @@ class Planning:
             for i in library.submaps
             if i.track in self._contradicting and i.track not in wanted_tracks
         }
-        return plan
+        return self._pulled(library, plan, fixes)
+
+    def _pulled(self, library: Library, plan: Plan, fixes: Sequence[Fix]) -> Plan:
+        if not fixes:
+            return plan
+        used = [constraint for constraint in plan.constraints if constraint.is_inlier]
+        edges: list[Edge] = []
+        if self._config.mode != "pairwise":  # that has no graph
+            edges += plan.odometry
+            edges += [constraint.edge for constraint in used]
+            edges += [decision.edge() for decision in library.confirmed]
+        components: list[Component] = []
+        told: list[Georeference | str] = []
+        for component in plan.components:
+            own = [edge for edge in edges if {edge.source, edge.target} <= component.keys()]
+            key = ("pulled", next(iter(component.items())), frozenset(c.key for c in used),
+                   tuple(d.number for d in library.confirmed), library.odometry.states(),
+                   tuple(fixes))  # fmt: skip
+            work = functools.partial(pulled_by_fixes, component, own, fixes)
+            pulled, georeference = library.remember(key, work)
+            components.append(pulled)
+            told.append(georeference)
+        return dataclasses.replace(plan, components=components, georeference=told[0])
 
     def _unsound(self, library: Library, plan: Plan) -> tuple[Track | None, str]:
         """The run that contradicts the others, by its matches or by its map, and how."""

@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.merging.decisions import (
 )
 from uw_dslam_ros2.core.merging.drawing import Drawing
 from uw_dslam_ros2.core.merging.frame import GlobalFrame
-from uw_dslam_ros2.core.merging.georeference import Georeference, georeference_of
+from uw_dslam_ros2.core.merging.georeference import Georeference
 from uw_dslam_ros2.core.merging.global_map import GlobalMap
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import LoopError
@@ -372,7 +372,7 @@ class MapQueue:
         return True
 
     def _georeference(self) -> Georeference | str:
-        return georeference_of(self._decisions.fixes, self._merged())
+        return self._plan().georeference if self._merged() else "nothing is in the map"
 
     def _merged(self) -> dict[SubmapId, SE2]:
         components = self._plan().components
@@ -417,6 +417,7 @@ class MapQueue:
                 self._answers,
                 self._standing,
                 self._frame.anchor,
+                self._decisions.fixes,
                 is_growing=self._is_growing,
             )
             self._standing = frozenset(

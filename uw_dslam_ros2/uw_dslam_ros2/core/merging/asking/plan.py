@@ -27,6 +27,7 @@ from dataclasses import dataclass
 
 from uw_dslam_ros2.core.merging.checks.verification import Verifier
 from uw_dslam_ros2.core.merging.config import VAGUE_CELLS, MapQueueConfig
+from uw_dslam_ros2.core.merging.georeference import Georeference
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import Component, Constraint
 from uw_dslam_ros2.core.merging.graph.consistency import Side
@@ -52,6 +53,8 @@ class Plan:
     odometry: list[Edge]
     components: list[Component]
     """The anchor's first, then by smallest submap."""
+    georeference: Georeference | str = "there are no fixes"
+    """Where the first one lies on earth, or why that is not known."""
 
 
 def make_plan(
