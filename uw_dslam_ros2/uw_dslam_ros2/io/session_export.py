@@ -6,16 +6,16 @@ import hashlib
 from pathlib import Path
 from urllib.parse import quote
 
-from uw_dslam_ros2.core.merging import ConstraintKind, MapQueue
+from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.run_names import RunNames
+from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.pose_graphs import pose_graph_bytes
 from uw_dslam_ros2.io.provenance import write_provenance
-from uw_dslam_ros2.io.trajectories import PoseGraphEdge, invertible, write_g2o, write_tum
+from uw_dslam_ros2.io.trajectories import write_tum
 
-__all__ = ["UNSURE_EDGE", "export_queue"]
+__all__ = ["export_queue"]
 
-UNSURE_EDGE = "refused by itself; believed because others agree with it"
-"""Comment on an edge of a pose graph."""
 _MAX_NAME = 80
 
 
@@ -47,20 +47,8 @@ def export_queue(folder: str | Path, queue: MapQueue) -> list[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         written.append(write_tum(path, stamps_ns, poses))
     joined = [record for record in records if record.component == 0]
-    keys = {record.submap.submap_id: index for index, record in enumerate(joined)}
-    vertices = {keys[r.submap.submap_id]: r.T_component_submap for r in joined}
-    edges = [
-        PoseGraphEdge(
-            keys[c.target],
-            keys[c.source],
-            c.T_target_source,
-            invertible(c.covariance) if c.kind is ConstraintKind.ODOMETRY else c.covariance,
-            UNSURE_EDGE if c.is_unsure else "",
-        )
-        for c in queue.constraints()
-        if c.is_inlier and c.source in keys and c.target in keys
-    ]
-    return [*written, write_g2o(folder / "graph.g2o", vertices, edges)]
+    graph = {folder / "graph.g2o": pose_graph_bytes(joined, queue.constraints())}
+    return [*written, *write_files(graph)]
 
 
 def _file_name(vehicle_id: str) -> str:

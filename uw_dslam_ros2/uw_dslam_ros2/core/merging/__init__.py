@@ -7,7 +7,7 @@ from uw_dslam_ros2.core.merging.decisions import (
     DecisionLog,
     DecisionRecord,
 )
-from uw_dslam_ros2.core.merging.georeference import Georeference
+from uw_dslam_ros2.core.merging.georeference import Fix, Georeference
 from uw_dslam_ros2.core.merging.graph.components import LoopError
 from uw_dslam_ros2.core.merging.growing_map import GrowingMap, GrowingMapConfig, MapChange
 from uw_dslam_ros2.core.merging.queue import MapQueue
@@ -29,6 +29,7 @@ __all__ = [
     "DecisionKind",
     "DecisionLog",
     "DecisionRecord",
+    "Fix",
     "Georeference",
     "GrowingMap",
     "GrowingMapConfig",

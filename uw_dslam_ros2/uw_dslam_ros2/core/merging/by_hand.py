@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 
 import numpy as np
 
@@ -27,7 +27,28 @@ from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track, track_name
 
-__all__ = ["matches_by_hand", "remarks", "stated_pose"]
+__all__ = ["check_decision", "matches_by_hand", "remarks", "stated_pose"]
+
+_NOT_PAIRWISE = DecisionKind.FORBID, DecisionKind.CONFIRM, DecisionKind.REGISTER
+"""The paper's queue of maps takes nothing back, and has no graph to put a constraint into."""
+
+
+def check_decision(decision: Decision, known: Container[SubmapId], mode: str) -> None:
+    """Refuse what a queue cannot do.
+
+    Raises
+    ------
+    InvalidInputError
+        If it names a submap that is not known, or what a mode does not have.
+    """
+    for name in ("source", "target"):
+        end = getattr(decision, name)
+        if end is not None and end not in known:
+            raise InvalidInputError(f"decision.{name} is {end}, which was never received")
+    if mode == "pairwise" and decision.kind in _NOT_PAIRWISE:
+        raise InvalidInputError(
+            f"decision.kind is {decision.kind.name}, expected another in mode pairwise"
+        )
 
 
 def matches_by_hand(

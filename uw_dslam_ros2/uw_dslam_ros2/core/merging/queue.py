@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.arrivals import Arrivals
 from uw_dslam_ros2.core.merging.asking.plan import Plan
-from uw_dslam_ros2.core.merging.by_hand import remarks, stated_pose
+from uw_dslam_ros2.core.merging.by_hand import check_decision, remarks, stated_pose
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.decisions import (
     Decision,
@@ -14,16 +16,13 @@ from uw_dslam_ros2.core.merging.decisions import (
     DecisionLog,
     DecisionRecord,
 )
-from uw_dslam_ros2.core.merging.drawing import Drawing
-from uw_dslam_ros2.core.merging.frame import GlobalFrame
-from uw_dslam_ros2.core.merging.georeference import Georeference
+from uw_dslam_ros2.core.merging.georeference import Fix, Georeference
 from uw_dslam_ros2.core.merging.global_map import GlobalMap
-from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
+from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import LoopError
-from uw_dslam_ros2.core.merging.graph.library import Library
-from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
-from uw_dslam_ros2.core.merging.planning import Planning
 from uw_dslam_ros2.core.merging.records import constraints_of, records_of
+from uw_dslam_ros2.core.merging.requests import Requests
+from uw_dslam_ros2.core.merging.standing import Standing
 from uw_dslam_ros2.core.merging.state import QueueState
 from uw_dslam_ros2.core.merging.trajectories import Trajectory, trajectories_of
 from uw_dslam_ros2.core.merging.types import (
@@ -39,11 +38,6 @@ from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["MapQueue"]
 
-_REPLAN_SHARE = 0.125
-"""Of a plan's questions: so many are answered before `next_requests` makes another plan."""
-_NOT_PAIRWISE = DecisionKind.FORBID, DecisionKind.CONFIRM, DecisionKind.REGISTER
-"""The paper's queue of maps takes nothing back, and has no graph to put a constraint into."""
-
 
 class MapQueue:
     """Collects the submaps of all vehicles and says which maps to register next.
@@ -57,18 +51,8 @@ class MapQueue:
         self._config = config or MapQueueConfig()
         self._arrivals = Arrivals(self._config.max_submap_cells)
         self._submaps = self._arrivals.submaps
-        self._decisions = DecisionLog()
-        self._frame = GlobalFrame(self._config.anchor_vehicle, self._config.resolution_m)
-        self._planning = Planning(self._config)
-        self._drawing = Drawing()
-        self._answers: dict[QueryKey, Answer] = {}
-        self._standing: frozenset[QueryKey] = frozenset()
-        self._library: Library | None = None
-        self._questions: list[Query] = []  # of the last plan
-        self._in_flight: dict[int, Query] = {}
-        self._next_request_id = 1
-        self._plan_cache: Plan | None = None
-        self._is_growing = False
+        self._now = Standing(self._config, self._arrivals)
+        self._requests = Requests()
 
     def add_submap(self, submap: Submap) -> bool:
         """Take a submap; a higher revision replaces, an equal or lower one changes nothing.
@@ -94,36 +78,34 @@ class MapQueue:
 
         Each stays in flight until `add_result` or `cancel_request`.
         """
-        asked = {query.key for query in self._in_flight.values()}
+        asked = self._requests.keys()
         requests: list[MatchRequest] = []
-        for query in self._open_questions():
+        for query in self._requests.unanswered(self._answers) or self._plan().wanted:
             if len(requests) >= max_requests:
                 break
             if query.key not in asked:
                 asked.add(query.key)
-                requests.append(self._request(query))
+                requests.append(self._requests.make(query, self._now.library()))
         return requests
 
     def add_result(self, request_id: int, result: RegistrationResult) -> None:
         """Take the answer to a request; one that is not in flight changes nothing."""
-        query = self._in_flight.pop(request_id, None)
-        if query is None:
-            return
-        self._answers[query.key] = Answer.of(query, result)
-        self._plan_cache = None
-        self._drawing.note_change()
+        query = self._requests.end(request_id)
+        if query is not None:
+            self._answers[query.key] = Answer.of(query, result)
+            self._now.change()
 
     def correct_answer(self, key: QueryKey, result: RegistrationResult) -> None:
         """Put another answer in the place of one that was had; no such one: nothing changes."""
         held = self._answers.get(key)
         if held is not None:
             self._answers[key] = Answer.of(held.query, result)
-            self._planning.forget()
+            self._now.planning.forget()
             self._change_submaps()
 
     def cancel_request(self, request_id: int) -> None:
         """Forget that a request was asked (its server died); it will be asked again."""
-        self._in_flight.pop(request_id, None)
+        self._requests.end(request_id)
 
     def forget_answers(self, vehicle_id: str) -> None:
         """Forget what was found about a vehicle's map: it is not any more what it was."""
@@ -137,8 +119,9 @@ class MapQueue:
             )
         }
         if about:
-            self._answers = {k: a for k, a in self._answers.items() if k not in about}
-            self._standing -= about
+            for key in about:
+                del self._answers[key]
+            self._now.held -= about
             self._change()
 
     @property
@@ -148,18 +131,18 @@ class MapQueue:
         True: only what may change something now is asked, see `growing`. False: all that is left
         is asked, and what comes out depends on the submaps alone and not on their order.
         """
-        return self._is_growing
+        return self._now.is_growing
 
     @is_growing.setter
     def is_growing(self, value: bool) -> None:
-        if value != self._is_growing:
-            self._is_growing = value
+        if value != self._now.is_growing:
+            self._now.is_growing = value
             self._change()
 
     @property
     def num_in_flight(self) -> int:
         """Requests asked and not answered yet."""
-        return len(self._in_flight)
+        return len(self._requests)
 
     @property
     def num_registrations(self) -> int:
@@ -179,20 +162,13 @@ class MapQueue:
         InvalidInputError
             If it names a submap that never came, or undoes what is not in force.
         """
-        for name in ("source", "target"):
-            end = getattr(decision, name)
-            if end is not None and end not in self._submaps:
-                raise InvalidInputError(f"decision.{name} is {end}, which was never received")
-        if self._config.mode == "pairwise" and decision.kind in _NOT_PAIRWISE:
-            raise InvalidInputError(
-                f"decision.kind is {decision.kind.name}, expected another in mode pairwise"
-            )
-        before, self._decisions = self._decisions, self._decisions.added(decision)
+        check_decision(decision, self._submaps, self._config.mode)
+        before, self._now.decisions = self._decisions, self._decisions.added(decision)
         if before.pin is not None and self._decisions.pin is None:
-            self._frame.release()
+            self._now.frame.release()
         if decision.kind is DecisionKind.UNDO:
             # What stood because of it would go on to stand.
-            self._standing = frozenset()
+            self._now.held = frozenset()
         self._change_submaps()
         return list(self._decisions)[-1]
 
@@ -205,8 +181,7 @@ class MapQueue:
         if not len(self._decisions):
             return []
         plan, found = self._plan(), self._georeference()
-        doubts = self._planning.doubts
-        library = self._current_library()
+        doubts, library = self._now.planning.doubts, self._now.library()
         told = remarks(self._decisions, library, plan, self._answers, found, doubts)
         return [
             DecisionRecord(d, self._decisions.undone_by(d.number) is None, told[d.number])
@@ -218,10 +193,31 @@ class MapQueue:
         """Decisions so far, those included that are undone."""
         return len(self._decisions)
 
+    def add_fixes(self, fixes: Sequence[Fix]) -> None:
+        """Take what instruments say of where submaps lie on earth; fixes of people are decisions.
+
+        Raises
+        ------
+        InvalidInputError
+            If one names a submap that never came.
+        """
+        for fix in fixes:
+            if fix.submap_id not in self._submaps:
+                raise InvalidInputError(
+                    f"fix.submap_id is {fix.submap_id}, which was never received"
+                )
+        self._now.fixes += tuple(fixes)
+        self._change()
+
     def georeference(self) -> Georeference | None:
         """Where "map" lies on earth; None where the fixes do not say it."""
         found = self._georeference()
         return None if isinstance(found, str) else found
+
+    def why_no_georeference(self) -> str:
+        """Why that is not known; empty where it is."""
+        found = self._georeference()
+        return found if isinstance(found, str) else ""
 
     def withdraw(self, submap_id: SubmapId, who: str = "", stamp_ns: int = 0) -> bool:
         """Take a submap out of the map and out of matching until `restore`, also when sent again.
@@ -237,22 +233,22 @@ class MapQueue:
     def submaps(self) -> list[SubmapRecord]:
         """All submaps, by vehicle, run and sequence."""
         answers = list(self._answers.values())
-        plan, library = self._plan(), self._current_library()
+        plan, library = self._plan(), self._now.library()
         return records_of(
             self._submaps,
             self._decisions.withdrawn(self._submaps),
             plan,
-            self._frame.anchor,
+            self._now.frame.anchor,
             answers,
-            self._planning.aside,
-            self._undrawable(),
+            self._now.planning.aside,
+            self._now.undrawable(plan),
             [decision.edge() for decision in library.confirmed],
         )
 
     def take_notices(self) -> list[str]:
         """What a person should know of, since the last call: frames that moved."""
         self._plan()
-        return self._frame.take_notices()
+        return self._now.frame.take_notices()
 
     def missing(self, max_per_track: int = 100) -> dict[Track, list[int]]:
         """Sequence numbers of each run that never came, though they were heard of; the first few.
@@ -282,7 +278,7 @@ class MapQueue:
     def constraints(self) -> list[Constraint]:
         """All edges of the pose graph with what is left of them after optimisation."""
         plan = self._plan()
-        return constraints_of(plan, [d.edge() for d in self._current_library().confirmed])
+        return constraints_of(plan, [d.edge() for d in self._now.library().confirmed])
 
     def loops(self) -> list[LoopError]:
         """Cycles of three and more submaps in the graph, and by how much each fails to close."""
@@ -339,12 +335,13 @@ class MapQueue:
             tuple(self._submaps[i].submap for i in sorted(self._submaps)),
             tuple(self._decisions),
             tuple(self._answers[key] for key in sorted(self._answers)),
-            self._frame.anchor,
-            self._frame.lattice,
+            self._now.frame.anchor,
+            self._now.frame.lattice,
             tuple(self._arrivals.tracks),
-            self._next_request_id,
-            self._standing,
-            self._frame.is_pinned,
+            self._requests.next_id,
+            self._now.held,
+            self._now.frame.is_pinned,
+            self._now.fixes,
         )
 
     @classmethod
@@ -353,13 +350,13 @@ class MapQueue:
         queue = cls(config)
         for submap in state.submaps:
             queue._arrivals.put(submap)
-        queue._decisions = DecisionLog(state.decisions)
-        queue._answers = {answer.query.key: answer for answer in state.answers}
-        queue._standing = frozenset(state.standing)
-        queue._frame.anchor, queue._frame.lattice = state.anchor, state.lattice
-        queue._frame.is_pinned = state.is_pinned
+        now, frame = queue._now, queue._now.frame
+        now.decisions = DecisionLog(state.decisions)
+        now.answers.update((answer.query.key, answer) for answer in state.answers)
+        now.held, now.fixes = frozenset(state.standing), state.fixes
+        frame.anchor, frame.lattice, frame.is_pinned = state.anchor, state.lattice, state.is_pinned
         queue._arrivals.tracks = list(state.tracks)
-        queue._next_request_id = state.next_request_id
+        queue._requests.next_id = state.next_request_id
         return queue
 
     def _switch(self, kind: DecisionKind, submap_id: SubmapId, who: str, stamp_ns: int) -> bool:
@@ -374,103 +371,29 @@ class MapQueue:
     def _georeference(self) -> Georeference | str:
         return self._plan().georeference if self._merged() else "nothing is in the map"
 
-    def _merged(self) -> dict[SubmapId, SE2]:
-        components = self._plan().components
-        return components[0] if components and self._frame.anchor in components[0] else {}
+    @property
+    def _decisions(self) -> DecisionLog:
+        return self._now.decisions
 
-    def _current_library(self) -> Library:
-        if self._library is None:
-            self._library = self._planning.library(self._submaps, self._decisions)
-        return self._library
+    @property
+    def _answers(self) -> dict[QueryKey, Answer]:
+        return self._now.answers
+
+    def _merged(self) -> dict[SubmapId, SE2]:
+        return self._now.merged(self._plan())
 
     def _change_submaps(self) -> None:
-        self._library = None
-        self._change()
+        self._now.change_submaps()
+        self._requests.questions = []
 
     def _change(self) -> None:
-        self._plan_cache, self._questions = None, []
-        self._drawing.note_change()
-
-    def _open_questions(self) -> list[Query]:
-        """Of the last plan while few of its questions are answered, else of a new one.
-
-        A plan costs as much as many answers where there are many submaps, and a few answers change
-        little of it.
-        """
-        still_open = [query for query in self._questions if query.key not in self._answers]
-        num_answered = len(self._questions) - len(still_open)
-        if still_open and num_answered <= _REPLAN_SHARE * len(self._questions):
-            return still_open
-        return self._plan().wanted
+        self._now.change()
+        self._requests.questions = []
 
     def _plan(self) -> Plan:
-        if self._plan_cache is None:
-            if not self._submaps:
-                return Plan([], [], [], [])
-            library = self._current_library()
-            pin = self._decisions.pin
-            if self._frame.anchor not in library.submaps:
-                self._note_frame(self._frame.choose(self._sound(library)))
-            plan = self._planning.plan(
-                library,
-                self._arrivals.tracks,
-                self._answers,
-                self._standing,
-                self._frame.anchor,
-                self._decisions.fixes,
-                is_growing=self._is_growing,
-            )
-            self._standing = frozenset(
-                constraint.key for constraint in plan.constraints if constraint.is_inlier
-            )
-            self._plan_cache, self._questions = plan, plan.wanted
-            is_open = self._is_growing or bool(plan.wanted) or bool(self._in_flight)
-            sound = self._sound(library)
-            if pin is not None and pin in sound:
-                has_moved = self._frame.hold(pin, sound[pin])
-            else:
-                has_moved = self._frame.settle(plan, sound, is_open)
-            if self._note_frame(has_moved):
-                self._plan_cache = None
-                return self._plan()
-        return self._plan_cache
-
-    def _sound(self, library: Library) -> dict[SubmapId, StoredSubmap]:
-        """What the frame may be pinned to."""
-        aside = self._planning.aside
-        return {i: stored for i, stored in library.submaps.items() if i not in aside}
-
-    def _note_frame(self, has_moved: bool) -> bool:
-        if has_moved:
-            self._drawing.restart()
-        return has_moved
-
-    def _request(self, query: Query) -> MatchRequest:
-        request_id = self._next_request_id
-        self._next_request_id += 1
-        self._in_flight[request_id] = query
-        library = self._current_library()
-        source, target = library.render(query.source), library.render(query.target)
-        return MatchRequest(
-            request_id,
-            source,
-            target,
-            query.prior,
-            query.source.ids,
-            query.target.ids,
-            query.source.reference,
-            query.target.reference,
-            query.key,
-        )
-
-    def _undrawable(self) -> dict[SubmapId, str]:
-        merged = self._merged()  # may move the frame, hence first
-        lattice = self._frame.lattice
-        return {} if lattice is None else self._drawing.left_out(lattice, self._submaps, merged)
+        plan = self._now.plan(len(self._requests))
+        self._requests.questions = plan.wanted
+        return plan
 
     def _drawn(self) -> GlobalMap | None:
-        merged = self._merged()  # may move the frame, hence first
-        if self._frame.lattice is None:
-            return None
-        withdrawn = self._decisions.withdrawn(merged)
-        return self._drawing.drawn(self._frame.lattice, self._submaps, merged, withdrawn)
+        return self._now.drawn(self._plan())

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from uw_dslam_ros2.core.grid import GridSpec
 from uw_dslam_ros2.core.merging.decisions import Decision
+from uw_dslam_ros2.core.merging.georeference import Fix
 from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
@@ -35,3 +36,5 @@ class QueueState:
     """Answers that hold in the graph."""
     is_pinned: bool = False
     """Whether the global frame stays where it is, whatever comes."""
+    fixes: tuple[Fix, ...] = ()
+    """What instruments say of where submaps lie on earth."""
