@@ -31,6 +31,7 @@ from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.examining import examine_recording, mended
 from uw_dslam_ros2.io.feeding import feed_runs, in_stamp_order
 from uw_dslam_ros2.io.mountings import Mountings, role_of
+from uw_dslam_ros2.io.readings import FixEvent
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.topics import base_frame_of
@@ -100,6 +101,9 @@ class VehicleSubmaps:
     diagnostics: dict[str, float | int | str]
     findings: tuple[Finding, ...] = ()
     pings: Mapping[SubmapId, Sequence[DrawnPing]] = field(default_factory=dict)
+    fixes: tuple[FixEvent, ...] = ()
+    """Positions on earth that it was told, in order of time; nothing of the map is made of them.
+    """
 
 
 def map_recordings(
@@ -171,6 +175,7 @@ def map_recording(
         return VehicleSubmaps(recording.vehicle_id, (), {}, tuple(found))
     run_ids, kept = itertools.count(1), KeptPings()
     newest: dict[SubmapId, Submap] = {}
+    fixes: list[FixEvent] = []
     number = 0
     has_yaw = has_yaw_rate = False
     first_ns: int | None = None
@@ -186,6 +191,9 @@ def map_recording(
             if number % 200 == 0:
                 _count(200)
             if isinstance(event, TruthEvent | TransformEvent):
+                continue
+            if isinstance(event, FixEvent):
+                fixes.append(event)
                 continue
             first_ns = event.stamp_ns if first_ns is None else first_ns
             if isinstance(event, ImuEvent):
@@ -238,6 +246,7 @@ def map_recording(
             *health_findings(vehicle),
         ),
         kept.of_submap,
+        tuple(fixes),
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
+import statistics
 import sys
 import time
 from collections.abc import Sequence
@@ -17,13 +19,17 @@ from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
 from uw_dslam_ros2.cli.scoring import Truth, read_truth
 from uw_dslam_ros2.core.errors import ConfigError, DataError, NothingMappedError
 from uw_dslam_ros2.core.findings import Finding
-from uw_dslam_ros2.core.merging import MapQueue
+from uw_dslam_ros2.core.merging import Georeference, MapQueue
+from uw_dslam_ros2.io.fixes import fixes_of_recordings
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
 from uw_dslam_ros2.io.session import SESSION_FOLDER, save_session
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import find_recordings
 
-__all__ = ["left_out", "main"]
+__all__ = ["about_fixes", "left_out", "main"]
+
+_MAX_SHARE_ASIDE = 0.05
+"""Of fixes, that are set aside without a warning: acoustic ones have such outliers."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -75,6 +81,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME=BAG[,BAG...]",
         help="bags of one vehicle, and its name, where topics do not tell",
     )
+    parser.add_argument(
+        "--fixes",
+        type=float,
+        metavar="SIGMA_M",
+        help="have positions on earth (NavSatFix, USBL) pull the map, each with at least this "
+        "standard deviation [m] (default: they are not used)",
+    )
     parser.add_argument("--title", default="", help="name of the run in the report")
     parser.add_argument("--no-report", action="store_true", help="no pictures, no HTML")
     return parser
@@ -82,6 +95,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(args: argparse.Namespace) -> int:
     started_s = time.monotonic()
+    if args.fixes is not None and not 0.0 < args.fixes < math.inf:
+        raise ConfigError(f"--fixes is {args.fixes}, expected metres > 0")
     named = _named_bags(args.vehicle)
     bags = [*args.bags, *(bag for own in named.values() for bag in own)]
     if not bags:
@@ -114,6 +129,10 @@ def _run(args: argparse.Namespace) -> int:
     for made in mapped:
         for submap in made.submaps:
             queue.add_submap(submap)
+    if args.fixes is not None:
+        events = {made.vehicle_id: made.fixes for made in mapped}
+        submaps = [submap for made in mapped for submap in made.submaps]
+        queue.add_fixes(fixes_of_recordings(events, submaps, args.fixes))
     say(f"merging {len(queue.submaps())} submaps")
     with progress_bar("registering", " pairs") as progress:
         settle(queue, config.registration, progress)
@@ -121,6 +140,8 @@ def _run(args: argparse.Namespace) -> int:
 
     outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
     findings += left_out(outcome)
+    if args.fixes is not None:
+        findings += about_fixes(outcome.georeference or queue.why_no_georeference())
     pings = {key: own for made in mapped for key, own in made.pings.items()}
     occupancy = config.mapper[mapped[0].vehicle_id].occupancy
     outcome = charted(outcome, pings, occupancy, findings.append)
@@ -167,6 +188,25 @@ def left_out(outcome: Outcome) -> list[Finding]:
             )
         )
     return found
+
+
+def about_fixes(found: Georeference | str) -> list[Finding]:
+    """What became of the fixes that were to be used."""
+    if isinstance(found, str):
+        return [Finding("no_georeference", "fix", f"the map has no place on earth: {found}")]
+    aside = [fit.metres_off for fit in found.fits if not fit.is_used]
+    if not aside:
+        return []
+    return [
+        Finding(
+            "fixes_set_aside",
+            "fix",
+            f"{len(aside)} of {len(found.fits)} positions contradict the others or the map, by "
+            f"{statistics.median(aside):.1f} m in the median, and do not count; is the standard "
+            "deviation that --fixes gives too small?",
+            severity="warning" if len(aside) > _MAX_SHARE_ASIDE * len(found.fits) else "info",
+        )
+    ]
 
 
 def _named_bags(options: Sequence[str]) -> dict[str, list[Path]]:

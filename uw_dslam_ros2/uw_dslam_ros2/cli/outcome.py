@@ -18,6 +18,7 @@ from uw_dslam_ros2.cli.decision_rows import DecisionRow
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import (
     Constraint,
+    Georeference,
     LoopError,
     MapProvenance,
     MapQueue,
@@ -27,13 +28,13 @@ from uw_dslam_ros2.core.merging import (
 )
 from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.run_names import RunNames
-from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.atomic import write_files
+from uw_dslam_ros2.io.earth import geotiff_bytes
 from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.pose_graphs import pose_graph_bytes
 from uw_dslam_ros2.io.provenance import write_provenance
-from uw_dslam_ros2.io.session_export import UNSURE_EDGE
-from uw_dslam_ros2.io.trajectories import PoseGraphEdge, invertible, write_g2o, write_tum
+from uw_dslam_ros2.io.trajectories import write_tum
 
 __all__ = ["Outcome", "RegistrationRow", "VehicleOutcome", "outcome_of", "write_outcome"]
 
@@ -156,6 +157,7 @@ class Outcome:
     decisions: tuple[DecisionRow, ...] = ()
     unmapped: tuple[str, ...] = ()
     """Vehicles of which there is no map at all."""
+    georeference: Georeference | None = None
 
     @property
     def names(self) -> RunNames:
@@ -236,6 +238,7 @@ def outcome_of(queue: MapQueue) -> Outcome:
         queue.provenance(),
         tuple(queue.loops()),
         tuple(DecisionRow.of(record, names) for record in queue.decisions()),
+        georeference=queue.georeference(),
     )
 
 
@@ -261,7 +264,9 @@ def write_outcome(folder: Path, outcome: Outcome) -> None:
     ``submaps/submaps.json``, ``trajectories/<vehicle>.tum`` (global frame) and
     ``trajectories/<vehicle>_alone.tum``, ``pose_graph.g2o``, ``pose_graph.json`` (all edges, with
     what became of them, and the cycles), ``registrations.json`` and ``.csv``,
-    ``global_map_contradictions.png`` and ``global_map_provenance.npz``.
+    ``global_map_contradictions.png`` and ``global_map_provenance.npz``, and where there are fixes
+    ``global_map.tif`` in their coordinates. Vertices of the graph are numbered as in
+    ``submaps.json``.
     """
     if outcome.global_map is not None:
         write_map(folder / "global_map", outcome.global_map)
@@ -285,9 +290,17 @@ def write_outcome(folder: Path, outcome: Outcome) -> None:
             folder / "registrations.json": json_bytes(rows),
             folder / "registrations.csv": _csv_bytes(rows),
             folder / "pose_graph.json": json_bytes(_graph_table(outcome)),
+            folder / "pose_graph.g2o": pose_graph_bytes(
+                (record for record in outcome.records if record.component == 0),
+                outcome.constraints,
+                {record.submap.submap_id: i for i, record in enumerate(outcome.records)},
+            ),
         }
     )
-    _write_graph(folder / "pose_graph.g2o", outcome)
+    if outcome.global_map is not None and outcome.georeference is not None:
+        found = outcome.georeference
+        picture = geotiff_bytes(outcome.global_map, found.T_earth_map, found.earth_frame)
+        write_files({folder / "global_map.tif": picture})
 
 
 def json_bytes(content: Any) -> bytes:
@@ -360,25 +373,3 @@ def _graph_table(outcome: Outcome) -> dict[str, Any]:
             for loop in outcome.loops
         ],
     }
-
-
-def _write_graph(path: Path, outcome: Outcome) -> None:
-    """Vertices are numbered as in submaps.json; only what shares the global frame is in it."""
-    numbers = {record.submap.submap_id: i for i, record in enumerate(outcome.records)}
-    vertices: dict[int, SE2] = {
-        numbers[record.submap.submap_id]: record.T_component_submap
-        for record in outcome.records
-        if record.state is SubmapState.MERGED
-    }
-    edges = [
-        PoseGraphEdge(
-            numbers[c.target],
-            numbers[c.source],
-            c.T_target_source,
-            invertible(c.covariance),
-            UNSURE_EDGE if c.is_unsure else "",
-        )
-        for c in outcome.constraints
-        if c.is_inlier and numbers[c.source] in vertices and numbers[c.target] in vertices
-    ]
-    write_g2o(path, vertices, edges)

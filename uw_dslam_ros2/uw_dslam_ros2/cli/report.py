@@ -16,6 +16,7 @@ from uw_dslam_ros2.cli.link_report import known_over_time
 from uw_dslam_ros2.cli.outcome import Outcome, json_bytes, write_outcome
 from uw_dslam_ros2.cli.scoring import Scores, Truth, score
 from uw_dslam_ros2.cli.wall_lines import walls_of, walls_picture
+from uw_dslam_ros2.core.merging import Georeference
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.provenance import contradictions_png
@@ -113,6 +114,7 @@ def report_dict(outcome: Outcome, facts: RunFacts, scores: Scores) -> dict[str, 
         ],
         "vehicles_not_mapped": list(outcome.unmapped),
         "num_registrations": len(outcome.registrations),
+        "georeference": _georeference_dict(outcome.georeference),
         "decisions": [asdict(row) for row in outcome.decisions],
         "verdicts": outcome.verdict_counts(),
         "scores": scores.to_dict(),
@@ -128,6 +130,19 @@ def report_dict(outcome: Outcome, facts: RunFacts, scores: Scores) -> dict[str, 
     if facts.link:
         result["link"] = facts.link
     return result
+
+
+def _georeference_dict(found: Georeference | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    used = [fit.metres_off for fit in found.fits if fit.is_used]
+    return {
+        "earth_frame": found.earth_frame,
+        "T_earth_map": found.T_earth_map.as_array().tolist(),
+        "num_fixes": len(found.fits),
+        "num_used": len(used),
+        "rms_m": math.sqrt(sum(m * m for m in used) / len(used)) if used else None,
+    }
 
 
 def headline(outcome: Outcome, scores: Scores) -> str:

@@ -194,18 +194,6 @@ class FixEvent:
     covariance: FloatArray | None
     is_geodetic: bool = False
 
-    def position_m(self, origin_deg: tuple[float, float]) -> FloatArray:
-        """[x, y]; of latitude and longitude, metres east and north of an origin nearby."""
-        if not self.is_geodetic:
-            return self.position
-        # Radii of curvature of WGS 84 at the origin; to 1 mm within a kilometre.
-        latitude = math.radians(origin_deg[0])
-        axis_m, eccentricity_squared = 6378137.0, 6.69437999014e-3
-        root = math.sqrt(1.0 - eccentricity_squared * math.sin(latitude) ** 2)
-        north_rad, east_rad = np.radians(self.position - np.asarray(origin_deg))
-        radius_m = axis_m * (1.0 - eccentricity_squared) / root**3
-        return np.array([east_rad * axis_m / root * math.cos(latitude), north_rad * radius_m])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TransformEvent:

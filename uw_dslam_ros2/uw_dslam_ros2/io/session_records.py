@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import sqlite3
 from collections.abc import Sequence
 from functools import partial
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging import Decision, DecisionKind, QueueState
+from uw_dslam_ros2.core.merging import Decision, DecisionKind, Fix, QueueState
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
 from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
@@ -62,6 +63,7 @@ def _meta(state: QueueState) -> dict[str, Any]:
         "next_request_id": state.next_request_id,
         "standing": [[s.hex(), t.hex(), prior] for s, t, prior in sorted(state.standing)],
         "is_pinned": state.is_pinned,
+        "fixes": [_fix_to_plain(fix) for fix in state.fixes],
     }
 
 
@@ -126,7 +128,20 @@ def _assembled(
             for source, target, prior in meta["standing"]
         ),
         bool(meta.get("is_pinned", True)),
+        tuple(_fix_from_plain(plain) for plain in meta.get("fixes", ())),
     )
+
+
+def _fix_to_plain(fix: Fix) -> list[Any]:
+    sigma_rad = fix.sigma_rad if math.isfinite(fix.sigma_rad) else None
+    place = fix.place.as_array().tolist()
+    return [fix.submap_id, fix.point, place, fix.sigma_m, sigma_rad, fix.earth_frame]
+
+
+def _fix_from_plain(plain: list[Any]) -> Fix:
+    submap_id, (x_m, y_m), place, sigma_m, sigma_rad, earth_frame = plain
+    sigma_rad = math.inf if sigma_rad is None else sigma_rad
+    return Fix(_submap_id(submap_id), (x_m, y_m), SE2(*place), sigma_m, sigma_rad, earth_frame)
 
 
 def _withdrawals(submap_ids: list[SubmapId]) -> list[Decision]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 import tempfile
 import zipfile
 from collections import defaultdict
@@ -14,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from uw_dslam_ros2.core.chart.lines import trace_walls
-from uw_dslam_ros2.core.grid import GridSpec
 from uw_dslam_ros2.core.merging import DecisionKind, SubmapRecord, SubmapState
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io.earth import geotiff_bytes, projection_bytes, world_file_bytes
 from uw_dslam_ros2.io.maps import write_map
-from uw_dslam_ros2.io.trajectories import PoseGraphEdge, g2o_bytes, invertible, tum_bytes
+from uw_dslam_ros2.io.pose_graphs import pose_graph_bytes
+from uw_dslam_ros2.io.trajectories import tum_bytes
 from uw_dslam_ros2.io.wall_files import dxf_bytes, walls_geojson_bytes
 from uw_dslam_ros2.view.overview import Names
 from uw_dslam_ros2.view.showing import Showing
@@ -29,24 +29,15 @@ _FIRST_TIME = (1980, 1, 1, 0, 0, 0)  # the same state gives the same bytes
 _README = """\
 Each folder holds one group of vehicles that share a frame; lengths are metres.
 map.yaml, map.pgm   as nav2's map_server reads them
-map.png, map.pgw    a picture and its world file, for GIS programs
-georeference.json   where there are fixes: where the map lies on earth; map.pgw is then in the
-                    coordinates that it names, and map.prj describes them, if they are UTM
+map.tif             GeoTIFF for GIS programs: per cent occupied, 255 where nothing is known
+map.png, map.pgw    a picture and its world file, for the same
+georeference.json   where there are fixes: where the map lies on earth; map.tif and map.pgw are
+                    then in the coordinates that it names, and map.prj describes them, if UTM
 walls.*             walls as lines, for GIS programs and for drawing programs
 tracks.geojson      the vehicles' tracks; coordinates are metres of the group's frame
 *.tum               the tracks with times: seconds x y z qx qy qz qw
 graph.g2o           the pose graph, without edges that were found wrong
 """
-
-_UTM = re.compile(r"EPSG:32([67])(\d\d)")
-_UTM_WKT = (
-    'PROJCS["WGS 84 / UTM zone {name}",GEOGCS["WGS 84",DATUM["WGS_1984",'
-    'SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
-    'UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
-    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",{meridian}],'
-    'PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
-    'PARAMETER["false_northing",{northing}],UNIT["metre",1]]'
-)
 
 
 def export_zip(showing: Showing) -> bytes:
@@ -80,32 +71,22 @@ def _files(showing: Showing, group: int, records: list[SubmapRecord]) -> dict[st
         with tempfile.TemporaryDirectory() as folder:
             for path in write_map(Path(folder) / "map", occupancy):
                 files[path.name] = path.read_bytes()
-        spec = occupancy.spec
         walls, piers = trace_walls(occupancy)
         files["walls.geojson"] = walls_geojson_bytes(walls, piers)
         files["walls.dxf"] = dxf_bytes(walls, piers)
-        T_earth_map = SE2()
+        frame, T_earth_map = "metres of the map", SE2()
         if group == 0 and showing.georeference is not None:
-            T_earth_map = showing.georeference[1]
-            files |= _on_earth(showing, *showing.georeference)
-        files["map.pgw"] = _world_file(spec, T_earth_map)
+            frame, T_earth_map = showing.georeference
+            files |= _on_earth(showing, frame, T_earth_map)
+        files["map.pgw"] = world_file_bytes(occupancy.spec, T_earth_map)
+        files["map.tif"] = geotiff_bytes(occupancy, T_earth_map, frame)
     tracks = _tracks(records, showing.names)
     for name, (stamps_ns, poses) in tracks.items():
         files[f"{_plain(name)}.tum"] = tum_bytes(stamps_ns, poses)
     files["tracks.geojson"] = _geojson(tracks)
-    keys = {record.submap.submap_id: index for index, record in enumerate(records)}
-    vertices = {keys[r.submap.submap_id]: r.T_component_submap for r in records}
-    edges = [
-        PoseGraphEdge(
-            keys[c.target],
-            keys[c.source],
-            c.T_target_source,
-            invertible(c.covariance),
-        )
-        for c in showing.constraints
-        if c.is_inlier and c.source in keys and c.target in keys
-    ]
-    files["graph.g2o"] = g2o_bytes(vertices, edges)
+    files["graph.g2o"] = pose_graph_bytes(
+        (r for r in showing.records if r.component == group), showing.constraints
+    )
     return files
 
 
@@ -143,15 +124,6 @@ def _geojson(tracks: dict[str, tuple[Any, Any]]) -> bytes:
     return json.dumps({"type": "FeatureCollection", "features": features}).encode()
 
 
-def _world_file(spec: GridSpec, T_earth_map: SE2) -> bytes:
-    """Six numbers: what a step right and a step down are, and where the first pixel lies."""
-    yaw = T_earth_map.yaw + spec.T_frame_grid.yaw
-    c, s = spec.resolution_m * np.cos(yaw), spec.resolution_m * np.sin(yaw)
-    # The middle of the picture's first cell, which is that of the last row.
-    x_m, y_m = T_earth_map.apply(spec.centers_of(np.array([[spec.num_rows - 1, 0]])))[0]
-    return "".join(f"{value:.9f}\n" for value in (c, s, s, -c, x_m, y_m)).encode()
-
-
 def _on_earth(showing: Showing, frame: str, T_earth_map: SE2) -> dict[str, bytes]:
     """Where the map lies, and by what fixes."""
     told = {
@@ -164,14 +136,8 @@ def _on_earth(showing: Showing, frame: str, T_earth_map: SE2) -> dict[str, bytes
         ],
     }
     files = {"georeference.json": json.dumps(told, indent=1).encode()}
-    zone = _UTM.fullmatch(frame)
-    if zone is not None and 1 <= int(zone[2]) <= 60:
-        is_south = zone[1] == "7"
-        files["map.prj"] = _UTM_WKT.format(
-            name=f"{int(zone[2])}{'S' if is_south else 'N'}",
-            meridian=6 * int(zone[2]) - 183,
-            northing=10_000_000 if is_south else 0,
-        ).encode()
+    if (projection := projection_bytes(frame)) is not None:
+        files["map.prj"] = projection
     return files
 
 

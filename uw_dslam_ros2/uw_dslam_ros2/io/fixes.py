@@ -1,0 +1,68 @@
+"""Position fixes of recordings, as fixes of submaps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from uw_dslam_ros2.core.merging import Fix
+from uw_dslam_ros2.core.merging.track_fixes import fixes_along
+from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.io.earth import utm_frame, utm_position
+from uw_dslam_ros2.io.readings import FixEvent
+
+__all__ = ["fixes_of_recordings"]
+
+_NO_NAME = "coordinates of the fixes"
+
+
+def fixes_of_recordings(
+    events: Mapping[str, Sequence[FixEvent]], submaps: Iterable[Submap], least_sigma_m: float
+) -> list[Fix]:
+    """Fixes of all vehicles' submaps.
+
+    Latitude and longitude become UTM, in the zone of the first of them for all; other positions
+    are in the coordinates that their frames name.
+
+    Parameters
+    ----------
+    events
+        By vehicle, in order of time.
+    submaps
+        Of all vehicles.
+    least_sigma_m
+        No fix is taken for surer, whatever it says of itself: see `fixes_along`.
+    """
+    own = list(submaps)
+    zone = next(
+        (utm_frame(*e.position.tolist()) for es in events.values() for e in es if e.is_geodetic),
+        "",
+    )
+    fixes: list[Fix] = []
+    for vehicle_id, of_vehicle in sorted(events.items()):
+        by_frame: dict[str, list[FixEvent]] = {}
+        for event in of_vehicle:
+            frame = zone if event.is_geodetic else event.frame_id or _NO_NAME
+            by_frame.setdefault(frame, []).append(event)
+        for frame, found in by_frame.items():
+            fixes += fixes_along(
+                (submap for submap in own if submap.vehicle_id == vehicle_id),
+                np.array([event.stamp_ns for event in found]),
+                np.array([_position(event, frame) for event in found]),
+                np.array([_sigma_m(event, least_sigma_m) for event in found]),
+                frame,
+            )
+    return fixes
+
+
+def _position(event: FixEvent, frame: str) -> tuple[float, float]:
+    first, second = event.position.tolist()
+    return utm_position(first, second, frame) if event.is_geodetic else (first, second)
+
+
+def _sigma_m(event: FixEvent, least_sigma_m: float) -> float:
+    if event.covariance is None:
+        return least_sigma_m
+    return max(least_sigma_m, math.sqrt(0.5 * float(np.trace(event.covariance))))
