@@ -5,6 +5,7 @@ import dataclasses
 import io
 import json
 import math
+import threading
 import time
 import zipfile
 
@@ -87,6 +88,28 @@ def posted(source, body, *, token="", given=None, kind="application/json", origi
 
 def states(source):
     return {s["name"]: s["state"] for s in source.showing().scene()["submaps"]}
+
+
+def test_what_is_made_of_a_merge_is_made_anew_when_all_is_worked_out(tmp_path):
+    save_session(tmp_path, missions.settled_queue())
+    made, is_first = [], threading.Event()
+
+    def write(queue):
+        made.append((queue.num_decisions, len(queue.next_requests(9))))
+        if len(made) == 1:
+            # Somebody else decides meanwhile, and need not wait.
+            source.decide(Decision(DecisionKind.UNDO, "Bo", undone=1))
+            is_first.set()
+        else:
+            raise DataError("the disk is full")
+
+    source = QueueSource("a harbour", load_session(tmp_path), tmp_path, write)
+    source.decide(Decision(DecisionKind.WITHDRAW, "Ann", source=TWO))
+    assert is_first.wait(20.0)
+    source.close()
+    assert made == [(1, 0), (2, 0)]
+    assert source.status()["notes"] == ["the disk is full"]
+    assert states(source)["auv_2/0"] == "merged"
 
 
 def test_a_decision_is_saved_and_shown(view_of, tmp_path):

@@ -19,10 +19,10 @@ from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
 from uw_dslam_ros2.cli.scoring import Truth, read_truth
 from uw_dslam_ros2.core.errors import ConfigError, DataError, NothingMappedError
 from uw_dslam_ros2.core.findings import Finding
-from uw_dslam_ros2.core.merging import Georeference, MapQueue
+from uw_dslam_ros2.core.merging import Decision, Georeference, MapQueue
 from uw_dslam_ros2.io.fixes import fixes_of_recordings
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
-from uw_dslam_ros2.io.session import SESSION_FOLDER, save_session
+from uw_dslam_ros2.io.session import SESSION_FOLDER, load_session, save_session
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import find_recordings
 
@@ -88,6 +88,12 @@ def _parser() -> argparse.ArgumentParser:
         help="have positions on earth (NavSatFix, USBL) pull the map, each with at least this "
         "standard deviation [m] (default: they are not used)",
     )
+    parser.add_argument(
+        "--decisions",
+        type=Path,
+        metavar="FOLDER",
+        help="take over what people decided about an earlier result of the same bags",
+    )
     parser.add_argument("--title", default="", help="name of the run in the report")
     parser.add_argument("--no-report", action="store_true", help="no pictures, no HTML")
     return parser
@@ -105,6 +111,7 @@ def _run(args: argparse.Namespace) -> int:
         raise DataError(f"{missing[0]} does not exist; expected a recording")
     file = SettingsFile(args.config)
     topics = TopicsConfig.of_options(args.topic)
+    decisions = () if args.decisions is None else _decisions(args.decisions)
 
     def settings_of(vehicle_id: str) -> SensorConfig:
         own = sensor_config(file, vehicle_id)
@@ -129,6 +136,8 @@ def _run(args: argparse.Namespace) -> int:
     for made in mapped:
         for submap in made.submaps:
             queue.add_submap(submap)
+    for decision in decisions:
+        queue.decide(decision)
     if args.fixes is not None:
         events = {made.vehicle_id: made.fixes for made in mapped}
         submaps = [submap for made in mapped for submap in made.submaps]
@@ -217,6 +226,11 @@ def _named_bags(options: Sequence[str]) -> dict[str, list[Path]]:
             raise ConfigError(f"vehicle {text!r}: expected NAME=BAG, or NAME=BAG,BAG")
         named.setdefault(name, []).extend(Path(bag) for bag in bags.split(","))
     return named
+
+
+def _decisions(folder: Path) -> tuple[Decision, ...]:
+    holder = folder / SESSION_FOLDER if (folder / SESSION_FOLDER).is_dir() else folder
+    return load_session(holder).to_state().decisions
 
 
 def _truth(args: argparse.Namespace, first_bag: Path) -> Truth | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import functools
 import os
 import signal
 import sys
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from uw_dslam_ros2.cli.common import parser_for, run_command
+from uw_dslam_ros2.cli.rewriting import has_report, write_anew
 from uw_dslam_ros2.io.session import SESSION_FOLDER, load_session
 from uw_dslam_ros2.view.queue_source import QueueSource
 from uw_dslam_ros2.view.server import ViewServer
@@ -33,8 +35,9 @@ def _parser() -> argparse.ArgumentParser:
         "view",
         "Show a merge in the browser: the global map, vehicles, submaps, constraints, and each\n"
         "registration with both maps laid on each other. Take what people say of it: withdraw,\n"
-        "forbid, confirm, lay by hand, pin, fix, undo. Without FOLDER it follows the\n"
-        "map_queue_manager of the running graph; its parameters may come after --ros-args.",
+        "forbid, confirm, lay by hand, pin, fix, undo; a result's maps and report are then\n"
+        "written anew. Without FOLDER it follows the map_queue_manager of the running graph;\n"
+        "its parameters may come after --ros-args.",
         "view result",
     )
     parser.add_argument(
@@ -69,7 +72,8 @@ def _follow_graph(args: argparse.Namespace, ros_args: Sequence[str]) -> int:
 def _run(args: argparse.Namespace) -> int:
     folder = args.folder
     holder = folder / SESSION_FOLDER if (folder / SESSION_FOLDER).is_dir() else folder
-    source = QueueSource(folder.resolve().name, load_session(holder), holder)
+    write = functools.partial(write_anew, folder) if has_report(folder) else None
+    source = QueueSource(folder.resolve().name, load_session(holder), holder, write)
     server = ViewServer(source, args.address, args.port, args.token)
     try:
         asyncio.run(_serve(server))

@@ -20,6 +20,8 @@ from uw_dslam_ros2.view.showing import Register, Showing
 
 __all__ = ["QueueSource", "register_by_engine"]
 
+_WRITTEN_WITHIN_S = 30.0
+
 
 class QueueSource:
     """A queue that changes only by what people decide.
@@ -35,16 +37,26 @@ class QueueSource:
     folder
         Session that decisions are saved in. It is taken, and read anew, with the first decision:
         who only looks is in nobody's way.
+    write
+        Called with a copy of the queue when all that a decision asked for is worked out: what
+        else is made of it is made anew. Others may decide meanwhile; then it is called again.
     """
 
-    def __init__(self, title: str, queue: MapQueue, folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        title: str,
+        queue: MapQueue,
+        folder: Path | None = None,
+        write: Callable[[MapQueue], None] | None = None,
+    ) -> None:
         self.title = title
-        self._queue, self._folder = queue, folder
+        self._queue, self._folder, self._write = queue, folder, write
         self._session: Session | None = None
         self._showing = Showing.of_queue(queue)
         self._lock = threading.Lock()
         self._worker: threading.Thread | None = None
         self._trouble = ""
+        self._doing = ""
         self._on_change: Callable[[], None] = lambda: None
 
     def showing(self) -> Showing:
@@ -54,7 +66,7 @@ class QueueSource:
     def status(self) -> dict[str, Any]:
         """What goes on."""
         is_busy = self._worker is not None and self._worker.is_alive()
-        notes = ["registering what the decisions ask for …"] if is_busy else []
+        notes = [self._doing] if is_busy else []
         return {"is_live": False, "notes": [*notes, *filter(None, [self._trouble])]}
 
     def register(self) -> Register:
@@ -93,7 +105,10 @@ class QueueSource:
         return taken
 
     def close(self) -> None:
-        """Let others have the session."""
+        """Let others have the session; what is being written is written to its end."""
+        worker = self._worker
+        if worker is not None and self._write is not None:
+            worker.join(_WRITTEN_WITHIN_S)
         with self._lock:
             if self._session is not None:
                 self._session.close()
@@ -124,8 +139,9 @@ class QueueSource:
         self._on_change()
 
     def _settle(self) -> None:
-        """Answer all that is open; others may decide meanwhile."""
+        """Work out all that is open, and what is made of it; others may decide meanwhile."""
         while True:
+            self._doing = "registering what the decisions ask for …"
             with self._lock:
                 requests = self._queue.next_requests(1)
                 if not requests:
@@ -134,20 +150,43 @@ class QueueSource:
                         self._save()
                     except DataError as error:
                         self._trouble = str(error)
-                    self._worker = None
+                    if self._write is None:
+                        self._rest()
+                        return
                     self._show()
-                    return
+                    num_decisions = self._queue.num_decisions
+                    copy = MapQueue.from_state(self._queue.to_state())
+            if not requests:
+                self._write_files(copy)
+                with self._lock:
+                    if self._queue.num_decisions == num_decisions:
+                        self._rest()
+                        return
+                continue
             (request,) = requests
             try:
                 result = register_by_engine(request.source, request.target, request.prior)
             except UwDslamError as error:
                 with self._lock:
                     self._queue.cancel_request(request.request_id)
-                    self._trouble, self._worker = str(error), None
-                    self._show()
+                    self._trouble = str(error)
+                    self._rest()
                 return
             with self._lock:
                 self._queue.add_result(request.request_id, result)
+
+    def _rest(self) -> None:
+        self._worker = None
+        self._show()
+
+    def _write_files(self, queue: MapQueue) -> None:
+        assert self._write is not None
+        self._doing = "writing map and report anew …"
+        self._on_change()
+        try:
+            self._write(queue)
+        except UwDslamError as error:
+            self._trouble = str(error)
 
 
 def register_by_engine(
