@@ -109,6 +109,8 @@ def test_the_archive_holds_what_is_shown(source, tmp_path):
     for track in tracks:
         _, poses = read_tum(tmp_path / "map" / f"{track['properties']['vehicle']}.tum")
         np.testing.assert_allclose(poses[:, :2], track["geometry"]["coordinates"], atol=1e-3)
+    walls = json.loads((tmp_path / "map" / "walls.geojson").read_text())["features"]
+    assert {wall["properties"]["last_seen_s"] for wall in walls} == {missions.STAMPS[-1] / 1e9}
     vertices, edges = read_g2o(tmp_path / "map" / "graph.g2o")
     assert len(vertices) == groups[0]["num_submaps"]
     assert len(edges) == len(groups[0]["vehicles"]) - 1

@@ -1,4 +1,4 @@
-"""Walls of a run's map as lines: when they were last seen, and a picture of them."""
+"""Walls of a run's map as lines, and a picture of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.map_drawing import (
     legend_below,
@@ -20,10 +19,9 @@ from uw_dslam_ros2.cli.map_drawing import (
 from uw_dslam_ros2.cli.outcome import Outcome
 from uw_dslam_ros2.core.chart.lines import Pier, Wall, trace_walls
 from uw_dslam_ros2.core.grid import UNKNOWN, OccupancyMap
-from uw_dslam_ros2.core.merging import MapProvenance
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.merging import SubmapState, last_seen_ns
 
-__all__ = ["last_seen_ns", "walls_of", "walls_picture"]
+__all__ = ["walls_of", "walls_picture"]
 
 _LINE_COLOR, _PIER_COLOR = "#D55E00", "#0072B2"
 
@@ -32,32 +30,8 @@ def walls_of(outcome: Outcome) -> tuple[list[Wall], list[Pier]]:
     """Walls and piers of the global map; none where there is no map."""
     if outcome.global_map is None:
         return [], []
-    ages = None
-    if outcome.provenance is not None:
-        submaps = [record.submap for record in outcome.records]
-        ages = last_seen_ns(outcome.global_map, outcome.provenance, submaps)
-    return trace_walls(outcome.global_map, ages)
-
-
-def last_seen_ns(
-    occupancy: OccupancyMap, provenance: MapProvenance, submaps: Sequence[Submap]
-) -> NDArray[np.int64]:
-    """When the walls (R, C) were last seen: the end of the latest submap that has the cell.
-
-    0 where no submap has it, and where there is no wall.
-    """
-    ends = {s.submap_id: int(s.trajectory_stamp_ns[-1]) for s in submaps if len(s.trajectory)}
-    latest = np.array(
-        [max((ends.get(i, 0) for i in ids), default=0) for ids in provenance.contributors],
-        dtype=np.int64,
-    )
-    walls = np.argwhere(occupancy.values > 50)
-    # The last pass draws its own map: its cells lie elsewhere in the same frame.
-    cells = provenance.spec.cells_of(occupancy.spec.centers_of(walls))
-    is_inside = ((cells >= 0) & (cells < provenance.spec.shape)).all(axis=1)
-    seen = np.zeros(occupancy.spec.shape, np.int64)
-    seen[tuple(walls[is_inside].T)] = latest[provenance.owners[tuple(cells[is_inside].T)]]
-    return seen
+    merged = [record for record in outcome.records if record.state is SubmapState.MERGED]
+    return trace_walls(outcome.global_map, last_seen_ns(outcome.global_map, merged))
 
 
 def walls_picture(occupancy: OccupancyMap, walls: Sequence[Wall], piers: Sequence[Pier]) -> Figure:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from uw_dslam_ros2.core.chart.lines import trace_walls
-from uw_dslam_ros2.core.merging import DecisionKind, SubmapRecord, SubmapState
+from uw_dslam_ros2.core.merging import DecisionKind, SubmapRecord, SubmapState, last_seen_ns
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.earth import geotiff_bytes, projection_bytes, world_file_bytes
 from uw_dslam_ros2.io.maps import write_map
@@ -71,7 +71,7 @@ def _files(showing: Showing, group: int, records: list[SubmapRecord]) -> dict[st
         with tempfile.TemporaryDirectory() as folder:
             for path in write_map(Path(folder) / "map", occupancy):
                 files[path.name] = path.read_bytes()
-        walls, piers = trace_walls(occupancy)
+        walls, piers = trace_walls(occupancy, last_seen_ns(occupancy, records))
         files["walls.geojson"] = walls_geojson_bytes(walls, piers)
         files["walls.dxf"] = dxf_bytes(walls, piers)
         frame, T_earth_map = "metres of the map", SE2()

@@ -1,5 +1,6 @@
 """Many submaps of many vehicles, in any order, into one map."""
 
+from uw_dslam_ros2.core.merging.ages import last_seen_ns
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.decisions import (
     Decision,
@@ -43,4 +44,5 @@ __all__ = [
     "StartPoses",
     "SubmapRecord",
     "SubmapState",
+    "last_seen_ns",
 ]
