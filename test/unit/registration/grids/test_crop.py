@@ -1,13 +1,14 @@
-"""Nothing outside of what is known decides on a match: margins, canvases, specks far away."""
+"""Neither what is outside of the known decides on a match, nor which way the rows run."""
 
 import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.registration.grids.crop import crop_to_known
+from uw_dslam_ros2.core.registration.grids.crop import crop_to_known, turn_to_own_axes
 from uw_dslam_ros2.core.registration.grids.register import register_grids
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import make_pair
+from uw_dslam_ros2.sim.map_variants import turned
 
 
 def _on_canvas(occupancy: OccupancyMap, left: int, below: int, side: int) -> OccupancyMap:
@@ -65,3 +66,44 @@ def test_a_canvas_changes_neither_verdict_nor_motion(is_matching):
     assert distance_m < 1e-6
     assert angle_rad < 1e-6
     assert plain.is_accepted == is_matching
+
+
+def test_all_quarter_turns_of_a_map_are_told_one_way():
+    values = np.full((3, 5), -1, np.int8)
+    values[0, 1], values[0, 2], values[2, 1] = 100, 0, 0
+    occupancy = OccupancyMap(GridSpec(0.5, 3, 5, SE2(1.0, 2.0, 0.3)), values)
+    told = turn_to_own_axes(occupancy)
+    for value in (0, 100):
+        np.testing.assert_allclose(
+            np.sort(told.spec.centers_of(np.argwhere(told.values == value)), axis=0),
+            np.sort(occupancy.spec.centers_of(np.argwhere(values == value)), axis=0),
+        )
+    for _ in range(4):
+        occupancy = turned(occupancy)
+        again = turn_to_own_axes(occupancy)
+        np.testing.assert_array_equal(again.values, told.values)
+        np.testing.assert_allclose(again.spec.corners(), told.spec.corners())
+
+
+def test_a_map_without_a_side_stays_as_it_is():
+    values = np.zeros((5, 5), np.int8)
+    values[2, 1:4] = 100  # known everywhere, walls about the middle
+    occupancy = OccupancyMap(GridSpec(0.5, 5, 5), values)
+    assert turn_to_own_axes(occupancy) is occupancy
+
+
+@pytest.mark.parametrize("kind", ["cave", "corridors"])
+def test_a_quarter_turn_changes_no_answer(kind):
+    pair = make_pair(kind, 0.5, "noisy", 7003, size_cells=130)
+    plain = register_grids(pair.source, pair.target)
+    for source, target in (
+        (turned(pair.source), pair.target),
+        (turned(turned(turned(pair.source))), turned(pair.target)),
+    ):
+        again = register_grids(source, target)
+        assert again.verdict is plain.verdict
+        assert again.probability == pytest.approx(plain.probability, abs=1e-6)
+        np.testing.assert_allclose(again.covariance, plain.covariance, atol=1e-9)
+        distance_m, angle_rad = again.T_target_source.distance_to(plain.T_target_source)
+        assert distance_m < 1e-6
+        assert angle_rad < 1e-6

@@ -1,6 +1,8 @@
-"""Maps without what is unknown around them, so that no canvas decides on a match."""
+"""Maps as a match sees them: neither canvas nor the order of rows and columns decides on it."""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
@@ -9,8 +11,9 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["crop_to_known"]
+__all__ = ["crop_to_known", "turn_to_own_axes"]
 
+_WALL_PERCENT = 65
 _LEAST_SHARE = 0.002  # of all known cells: an island with fewer is a speck
 
 
@@ -44,6 +47,45 @@ def crop_to_known(occupancy: OccupancyMap) -> OccupancyMap:
     num_rows, num_cols = values.shape
     part = GridSpec(spec.resolution_m, num_rows, num_cols, spec.T_frame_grid @ corner)
     return OccupancyMap(part, np.ascontiguousarray(values))
+
+
+def turn_to_own_axes(occupancy: OccupancyMap) -> OccupancyMap:
+    """The map turned by the quarter turns that what is in it decides, in the same frame.
+
+    Larger cells are blocks that begin in a map's corner, and every grid has four of them. So of
+    the four ways to tell one map, always the same one is chosen: that in which the middle of what
+    is known, or of the walls if that is the middle of the map, lies ahead, towards higher columns.
+    """
+    for mask in (occupancy.known, occupancy.values >= _WALL_PERCENT):
+        forward, left = _imbalance(mask)
+        if forward or left:
+            break
+    while not (forward >= 0 and -forward < left <= forward) and (forward or left):
+        occupancy = _quarter_turned(occupancy)
+        forward, left = -left, forward
+    return occupancy
+
+
+def _imbalance(mask: NDArray[np.bool_]) -> tuple[int, int]:
+    """How far the middle of the set cells lies off that of the map, along columns and rows.
+
+    Times twice their number: a whole number, so that no rounding decides.
+    """
+    rows, cols = (mask.sum(axis=axis, dtype=np.int64) for axis in (1, 0))
+    balances = []
+    for counts in (cols, rows):
+        places = 2 * np.arange(len(counts)) + 1 - len(counts)
+        balances.append(int(counts @ places))
+    return balances[0], balances[1]
+
+
+def _quarter_turned(occupancy: OccupancyMap) -> OccupancyMap:
+    """The same map in the same frame, with what lay towards higher columns now at higher rows."""
+    spec = occupancy.spec
+    corner = spec.T_frame_grid @ SE2(0.0, spec.num_rows * spec.resolution_m, -0.5 * math.pi)
+    values = np.ascontiguousarray(occupancy.values.T[:, ::-1])
+    turned = GridSpec(spec.resolution_m, spec.num_cols, spec.num_rows, corner)
+    return OccupancyMap(turned, values)
 
 
 def _bounds(mask: NDArray[np.bool_]) -> tuple[slice, slice] | None:

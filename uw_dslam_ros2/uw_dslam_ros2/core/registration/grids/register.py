@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.crop import crop_to_known
+from uw_dslam_ros2.core.registration.grids.crop import crop_to_known, turn_to_own_axes
 from uw_dslam_ros2.core.registration.grids.finding.candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grids.finding.frames import GridFrames
 from uw_dslam_ros2.core.registration.grids.finding.search import search_poses
@@ -129,7 +129,8 @@ class _GridMatch:
         prior: PriorWindow | None,
         clock: Clock | None,
     ) -> None:
-        self._source, self._target = crop_to_known(source), crop_to_known(target)
+        self._source = turn_to_own_axes(crop_to_known(source))
+        self._target = turn_to_own_axes(crop_to_known(target))
         self._frames = GridFrames(self._source.spec, self._target.spec)
         self._config, self._prior, self._clock = config, prior, clock
         self._start_s = clock() if clock is not None else math.nan
