@@ -23,9 +23,11 @@ from uw_dslam_ros2.core.doctor.fits import (
     fit_velocity,
     turn_bias,
 )
+from uw_dslam_ros2.core.doctor.images import judge_images
 from uw_dslam_ros2.core.doctor.imu import ImuState, compare_yaw_and_rate
 from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
+from uw_dslam_ros2.core.doctor.scales import confidence_in, judge_scale
 from uw_dslam_ros2.core.findings import Finding
 
 __all__ = ["examine"]
@@ -39,15 +41,6 @@ _MIN_READINGS = 20
 _MAX_TURN_COST = 1.5
 _MIN_OFFSET_RAD = math.radians(4.0)
 _MIN_DRIFT_RAD_S = math.radians(0.05)
-_MIN_SCALE_ERROR = 0.019
-_USUAL_SCALE_ERROR = 0.015
-"""A DVL and a speed of sound that are as good as data sheets say disagree by less."""
-_UNIT_SCALE = 1.3
-_UNIT_TOLERANCE = 0.025  # tells knots from half
-_UNITS = {
-    "millimetres per second": 1e-3, "centimetres per second": 1e-2, "knots": 0.5144,
-    "kilometres per hour": 1.0 / 3.6,
-}  # fmt: skip
 
 
 def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "") -> Examination:
@@ -58,10 +51,7 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
     result = Examination(pixels=pings.pixels or "")
     result.has_yaw = bool(np.isfinite(navigation.yaw_rad).any())
     result.has_yaw_rate = bool(np.isfinite(navigation.yaw_rate_rad_s).any())
-    if pings.pixels == "power" and pings.pixels_read_as == "amplitude":
-        _say_power(result, vehicle_id)
-    if pings.pixels == "decibel" and pings.pixels_read_as != "decibel":
-        _say_decibels(result, pings.db_per_count, vehicle_id)
+    judge_images(result, pings, vehicle_id)
     if len(navigation.imu_s) < _MIN_READINGS:
         return result
     imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
@@ -72,37 +62,6 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
     if len(motions) >= _MIN_MOTIONS:
         _Trial(result, navigation, imu, motions, pings, vehicle_id).run()
     return result
-
-
-def _say_power(result: Examination, vehicle_id: str) -> None:
-    result.add(
-        Finding(
-            "sonar_power",
-            "sonar",
-            "its pixels vary as an echo's power does, not its amplitude: read as amplitude they "
-            "give many false echoes (mapper.sonar.intensity: power)",
-            vehicle_id=vehicle_id,
-        )
-    )
-    result.mended.add("sonar_power")
-    result.sonar_changes["intensity"] = "power"
-
-
-def _say_decibels(result: Examination, db_per_count: float, vehicle_id: str) -> None:
-    result.add(
-        Finding(
-            "sonar_decibel",
-            "sonar",
-            "its pixels vary as much where they are dark as where they are bright, as the "
-            "logarithm of an echo does: read as amplitude they show no echo (mapper.sonar."
-            f"intensity: decibel, mapper.sonar.db_per_count: {db_per_count:.2g})",
-            vehicle_id=vehicle_id,
-        )
-    )
-    result.mended.add("sonar_decibel")
-    result.sonar_changes |= {
-        "intensity": "decibel", "db_per_count": float(f"{db_per_count:.2g}"),
-    }  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +130,7 @@ class _Trial:
         if fit is not None:
             if not fit.is_mirrored:
                 self._judge_offset(fit)
-            self._judge_scale(fit)
+            judge_scale(self._result, fit, self._vehicle_id)
 
     def _believed(self, fits: list[TurnFit]) -> list[TurnFit] | None:
         best, other = fits[0], fits[1]
@@ -213,7 +172,7 @@ class _Trial:
             "imu",
             f"it turns by {60.0 * abs(math.degrees(bias)):.1f} degrees a minute where the sonar's "
             "echoes do not: its gyro has a bias; let it settle before the dive, or calibrate it",
-            _confidence_in(bias, sigma),
+            confidence_in(bias, sigma),
         )
 
     # --- who turns the other way
@@ -326,7 +285,7 @@ class _Trial:
                 "sonar",
                 f"its echoes move as if it were mounted {-degrees:.0f} degrees from where tf says "
                 f"(conventions.sonar_yaw_offset_rad: {-offset:.3f}), counter-clockwise",
-                _confidence_in(offset, sigma),
+                confidence_in(offset, sigma),
                 sonar_yaw_offset_rad=round(-offset, 4),
             )
         elif abs(abs(degrees) - 180.0) < 15.0:
@@ -335,7 +294,7 @@ class _Trial:
                 "velocity",
                 "its velocity has the wrong sign: it is the bottom's against the vehicle "
                 "(conventions.velocity_yaw_offset_rad: 3.1416)",
-                _confidence_in(offset, sigma),
+                confidence_in(offset, sigma),
                 velocity_yaw_offset_rad=round(math.pi, 4),
             )
         else:
@@ -344,59 +303,9 @@ class _Trial:
                 "velocity",
                 f"its velocity is {-degrees:.0f} degrees off the sonar's motion: it is mounted "
                 f"turned (conventions.velocity_yaw_offset_rad: {offset:.3f})",
-                _confidence_in(offset, sigma),
+                confidence_in(offset, sigma),
                 velocity_yaw_offset_rad=round(offset, 4),
             )
-
-    def _judge_scale(self, fit: VelocityFit) -> None:
-        sigma = fit.factor_sigma
-        error = abs(fit.scale - 1.0)
-        if error < _MIN_SCALE_ERROR or error - 2.0 * sigma < _USUAL_SCALE_ERROR:
-            return
-        if not 1.0 / _UNIT_SCALE < fit.scale < _UNIT_SCALE:
-            name, unit = min(_UNITS.items(), key=lambda item: abs(math.log(fit.scale / item[1])))
-            is_unit = abs(math.log(fit.scale / unit)) < _UNIT_TOLERANCE
-            factor = unit if is_unit else fit.scale
-            self._add(
-                "dvl_unit",
-                "velocity",
-                f"its velocity is {1.0 / fit.scale:.3g} times that of the sonar's echoes"
-                + (f": it is in {name}" if is_unit else "")
-                + f" (conventions.velocity_scale: {factor:.4g}"
-                + (
-                    ")"
-                    if is_unit
-                    else "; if it is the sonar's ranges that are wrong, "
-                    f"conventions.sonar_range_scale: {1.0 / fit.scale:.4g} instead)"
-                ),
-                velocity_scale=float(f"{factor:.4g}"),
-            )
-            return
-        confidence = _confidence_in(error - 0.5 * _MIN_SCALE_ERROR, sigma)
-        # Only the ratio shows. Instruments are set for the sea, 1500 m/s; colder or fresher water
-        # makes one that is not set for it measure too long, and hardly any water too short.
-        if fit.scale > 1.0:
-            self._add(
-                "sound_speed",
-                "sonar",
-                f"its echoes move {100.0 * (fit.scale - 1.0):.1f} % farther than the dvl says, as "
-                "with a speed of sound that is too high for colder or fresher water "
-                f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f}); or the dvl's scale is "
-                f"too small (conventions.velocity_scale: {fit.scale:.3f} instead)",
-                confidence,
-                sonar_range_scale=round(1.0 / fit.scale, 4),
-            )
-            return
-        self._add(
-            "dvl_scale",
-            "velocity",
-            f"its way is {100.0 * (1.0 / fit.scale - 1.0):.1f} % longer than the sonar's echoes "
-            "move, as with a speed of sound that is too high for colder or fresher water "
-            f"(conventions.velocity_scale: {fit.scale:.3f}); or the sonar's is too low "
-            f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f} instead)",
-            confidence,
-            velocity_scale=round(fit.scale, 4),
-        )
 
     # --- time
     # -------------------------------------------------------------------------------------------
@@ -438,8 +347,3 @@ class _Trial:
 
 def _late(delay_s: float) -> str:
     return f"{abs(delay_s):.2f} s {'later' if delay_s > 0.0 else 'earlier'}"
-
-
-def _confidence_in(value: float, sigma: float) -> float:
-    """How sure a value is not zero, 0.5 to 1."""
-    return 0.5 + 0.5 * math.erf(abs(value) / max(sigma, 1e-9) / math.sqrt(2.0))
