@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.conventions import correct, correct_mounting
-from uw_dslam_ros2.io.readings import DepthEvent, ImageEvent, ImuEvent, PointsEvent, VelocityEvent
+from uw_dslam_ros2.io.readings import (
+    DepthEvent,
+    ImageEvent,
+    ImuEvent,
+    PointsEvent,
+    PoseEvent,
+    VelocityEvent,
+)
 
 SECOND = 1_000_000_000
 KEY = ("auv_1", 100 * SECOND, "frame")
@@ -52,6 +60,27 @@ def test_a_bow_up_stays_up_from_ned():
     x, y, z, w = correct(event, Conventions(imu_orientation="ned")).orientation_xyzw
     forward = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
     np.testing.assert_allclose(forward, [0.0, math.cos(0.2), math.sin(0.2)], atol=1e-12)
+
+
+def test_a_pose_in_ned_becomes_one_in_enu():
+    # 1 m north and 2 m east of the origin, heading 30 degrees, 3 m deep.
+    covariance = np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 1.0]])
+    said = PoseEvent(
+        *KEY,
+        "base_link",
+        SE2(1.0, 2.0, math.radians(30.0)),
+        covariance,
+        np.array([1.0, 0.2, 0.3]),
+        height_m=3.0,
+    )
+    assert correct(said, Conventions()) is said
+    meant = correct(said, Conventions(odometry="ned"))
+    assert meant.T_frame_base.as_array() == pytest.approx([2.0, 1.0, math.radians(60.0)])
+    np.testing.assert_allclose(
+        meant.covariance, [[9.0, 0.5, -0.2], [0.5, 4.0, -0.1], [-0.2, -0.1, 1.0]]
+    )
+    np.testing.assert_allclose(meant.velocity_m_s, [1.0, -0.2, -0.3])
+    assert meant.height_m == -3.0
 
 
 def test_what_is_not_filled_is_not_used():

@@ -129,6 +129,15 @@ def test_the_vehicles_own_filter_is_its_odometry_and_its_truth_is_not():
     }
 
 
+def test_the_filter_is_not_used_beside_what_it_is_made_of():
+    topics = table("/auv_1") | {"/auv_1/odometry/filtered": ODOMETRY}
+    (vehicle,) = find_vehicles([topics], ["bag"])
+    assert "odometry" not in vehicle.topics
+    assert vehicle.unused["/auv_1/odometry/filtered"] == "dvl and imu are there themselves"
+    (chosen,) = find_vehicles([topics], ["bag"], settings_of(odometry="odometry/filtered"))
+    assert chosen.topics["odometry"] == "/auv_1/odometry/filtered"
+
+
 def test_of_two_that_are_alike_the_user_must_choose():
     topics = table("/auv_1") | {"/auv_1/imu_b": IMU, "/auv_1/imu_a": IMU}
     del topics["/auv_1/imu"]

@@ -45,6 +45,12 @@ class Conventions(Config):
     velocity_delay_s: float = setting(
         0.0, -1e6, 1e6, "how much later than true the velocity's stamps are [s]"
     )
+    odometry: str = setting(
+        "enu",
+        choices=("enu", "ned"),
+        doc="poses of the vehicle's own filter: enu (x east or ahead, y to the left of x, z up), "
+        "or ned (north, east, down)",
+    )
     sonar_is_mirrored: bool = setting(False, doc="port and starboard of the sonar are exchanged")
     sonar_yaw_offset_rad: float = setting(
         0.0, -3.2, 3.2, "turns the echoes about the sonar, counter-clockwise seen from above [rad]"

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.readings import (
     BeamsEvent,
     Event,
     ImageEvent,
     ImuEvent,
     PointsEvent,
+    PoseEvent,
     ScanEvent,
     VelocityEvent,
 )
@@ -43,6 +45,8 @@ def correct[EventT: Event](event: EventT, conventions: Conventions) -> EventT | 
         result = _imu(event, conventions)
     elif isinstance(event, VelocityEvent):
         result = _velocity(event, conventions)
+    elif isinstance(event, PoseEvent) and conventions.odometry == "ned":
+        result = _pose_in_enu(event)
     elif isinstance(event, _Ping):
         result = _ping(event, conventions)
     return cast("EventT | None", result)
@@ -119,6 +123,21 @@ def _velocity(event: VelocityEvent, conventions: Conventions) -> VelocityEvent |
         stamp_ns=_earlier(event.stamp_ns, conventions.velocity_delay_s),
         velocity_m_s=event.velocity_m_s * scale,
         covariance=None if covariance is None else covariance * scale**2,
+    )
+
+
+def _pose_in_enu(event: PoseEvent) -> PoseEvent:
+    """Of a pose in north-east-down: its yaw is a heading, from north and clockwise."""
+    pose = event.T_frame_base
+    # Of [x, y, yaw] in east-north-up by those in north-east-down.
+    swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    velocity = event.velocity_m_s
+    return replace(
+        event,
+        T_frame_base=SE2(pose.y, pose.x, 0.5 * math.pi - pose.yaw),
+        covariance=None if event.covariance is None else swap @ event.covariance @ swap.T,
+        velocity_m_s=None if velocity is None else velocity * np.array([1.0, -1.0, -1.0]),
+        height_m=-event.height_m,
     )
 
 

@@ -19,7 +19,14 @@ from uw_dslam_ros2.core.sonar import SonarConfig
 from uw_dslam_ros2.io.conventions import correct_mounting
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.feeding import feed
-from uw_dslam_ros2.io.readings import Event, Reading, TransformEvent, TruthEvent, VelocityEvent
+from uw_dslam_ros2.io.readings import (
+    Event,
+    PoseEvent,
+    Reading,
+    TransformEvent,
+    TruthEvent,
+    VelocityEvent,
+)
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.vehicles import VehicleRecording
 
@@ -84,23 +91,28 @@ def examine_readings(
                 mounting = correct_mounting(event, mounting_of(event), conventions)
                 is_axis_open |= _is_axis_open(event, mounting)
                 feed(collector, event, mounting)  # type: ignore[arg-type]  # has a mapper's inputs
+                if isinstance(event, PoseEvent):
+                    collector.note_frame(event.frame_id, event.height_m)
             except InvalidInputError:
                 continue  # mapping says what is wrong with it
 
-    collect(lambda role, _: role in ("imu", "velocity"))
-    navigation = collector.navigation()
-    if "sonar" in stamps and len(navigation.imu_s):
+    collect(lambda role, _: role in ("imu", "velocity", "odometry"))
+    navigation, odometry = collector.navigation(), collector.odometry()
+    turn_s, rates = navigation.imu_s, navigation.yaw_rate_rad_s
+    if not len(turn_s):
+        turn_s, rates = odometry.stamp_s, odometry.yaw_rates()
+    if "sonar" in stamps and len(turn_s):
         ping_ns = np.unique(stamps["sonar"])
         ping_s = np.asarray((ping_ns - collector.start_ns) * 1e-9, np.float64)
-        chosen = choose_pings(ping_s, navigation.imu_s, navigation.yaw_rate_rad_s)
+        chosen = choose_pings(ping_s, turn_s, rates)
         wanted = {int(stamp_ns) for stamp_ns in ping_ns[chosen]}
         collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in wanted)
         share = share_with_echoes(collector.pings())
         if not collector.is_turning and (num_bursts := more_bursts(ping_s, share)):
-            chosen = choose_pings(ping_s, navigation.imu_s, navigation.yaw_rate_rad_s, num_bursts)
+            chosen = choose_pings(ping_s, turn_s, rates, num_bursts)
             more = {int(stamp_ns) for stamp_ns in ping_ns[chosen]} - wanted
             collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in more)
-    found = examine(collector.navigation(), collector.pings(), vehicle_id)
+    found = examine(collector.navigation(), collector.pings(), vehicle_id, odometry)
     if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):
         found.is_turning = True
         spans = choose_spans(navigation, collector.seconds(np.unique(stamps["sonar"])))

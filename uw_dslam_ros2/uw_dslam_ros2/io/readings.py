@@ -167,7 +167,7 @@ class PoseEvent:
     """Where the vehicle's own filter believes that it is, in a frame that drifts.
 
     ``covariance`` (3, 3) of x, y, yaw or None; ``velocity_m_s`` (3,) over ground in
-    ``child_frame_id`` or None.
+    ``child_frame_id`` or None; ``height_m`` is z in the frame, NaN where nobody fills it in.
     """
 
     vehicle_id: str
@@ -177,6 +177,7 @@ class PoseEvent:
     T_frame_base: SE2
     covariance: FloatArray | None
     velocity_m_s: FloatArray | None = None
+    height_m: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -201,9 +201,11 @@ def topics_of(
         if not found:
             continue
         best = found[0]
+        if role == "odometry" and {"velocity", "imu"} <= set(topics):
+            # It is made of the same measurements: to use both would count them twice.
+            unused |= {c[-1]: "dvl and imu are there themselves" for c in found}
+            continue
         if len(found) > 1 and role in _REQUIRED and found[1][:-1] == best[:-1]:
-            if role == "odometry" and {"velocity", "imu"} <= set(topics):
-                continue  # not needed
             raise DataError(
                 f"{vehicle_id}: two topics could be its {WORDS.get(role, role)}: {best[-1]} and "
                 f"{found[1][-1]}; say which, with --topic {role}={best[-1]}, or in the settings "

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uw_dslam_ros2.core.doctor.odometry import OdometrySample
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
 from uw_dslam_ros2.core.doctor.speckle import decibels_per_count, patch_levels, quantity_of
 from uw_dslam_ros2.core.doctor.turning import BeamSample
+from uw_dslam_ros2.core.navigation.pose_differences import PoseDifferences
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
     BeamGatherer,
@@ -43,6 +46,8 @@ class SampleCollector:
         self._imu: list[tuple[int, float, float]] = []
         self._velocity: list[tuple[int, float, float]] = []
         self._T_base_dvl = SE2()
+        self._poses: list[tuple[int, SE2, float]] = []
+        self._odometry_frame = ""
         self._pings: list[tuple[int, FloatArray]] = []
         self._beams: list[tuple[Beams, SE2, FloatArray | None]] = []
         self._T_base_sonar = SE2()
@@ -51,7 +56,9 @@ class SampleCollector:
     @property
     def start_ns(self) -> int:
         """What seconds are counted from: the first reading."""
-        stamps = [rows[0][0] for rows in (self._imu, self._velocity, self._pings) if rows]
+        stamps = [
+            rows[0][0] for rows in (self._imu, self._velocity, self._poses, self._pings) if rows
+        ]
         return min(stamps, default=0)
 
     def attitude_at(self, stamp_ns: int) -> None:  # noqa: ARG002 (as a mapper has it)
@@ -95,8 +102,15 @@ class SampleCollector:
     def add_depth(self, stamp_ns: int, depth_m: float) -> None:
         """Depth says nothing of conventions in the plane."""
 
-    def add_pose(self, *_: Any, **__: Any) -> None:
-        """The vehicle's own odometry is not examined."""
+    def add_pose(self, stamp_ns: int, T_frame_base: SE2) -> None:
+        """As a mapper's: a pose of the vehicle's own filter."""
+        self._poses.append((stamp_ns, T_frame_base, math.nan))
+
+    def note_frame(self, frame_id: str, height_m: float) -> None:
+        """Keep the frame of the last pose, and its z in it."""
+        if self._poses:
+            self._poses[-1] = (*self._poses[-1][:2], height_m)
+            self._odometry_frame = frame_id
 
     def add_beams(
         self, beams: Beams, T_base_sonar: SE2, projection: FloatArray | None = None
@@ -159,6 +173,21 @@ class SampleCollector:
             self.seconds([row[0] for row in velocity]),
             np.array([row[1:] for row in velocity]).reshape(-1, 2),
             (mount.x, mount.y),
+        )
+
+    def odometry(self) -> OdometrySample:
+        """What the vehicle's own filter said, in order of stamps."""
+        poses = sorted(self._poses, key=lambda pose: pose[0])
+        differences = PoseDifferences()
+        moved = [differences.add(stamp_ns, pose) for stamp_ns, pose, _ in poses]
+        velocity = [found for found in moved if found is not None]
+        return OdometrySample(
+            self.seconds([stamp_ns for stamp_ns, _, _ in poses]),
+            np.array([pose.yaw for _, pose, _ in poses]),
+            self.seconds([stamp_ns for stamp_ns, _ in velocity]),
+            np.array([v for _, v in velocity]).reshape(-1, 2),
+            np.array([height_m for _, _, height_m in poses]),
+            "ned" in re.split("[^a-z]+", self._odometry_frame.lower()),
         )
 
     def pings(self) -> PingSample:

@@ -18,6 +18,7 @@ from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.fits import (
     TurnFit,
     VelocityFit,
+    believed,
     confidence_of,
     fit_turns,
     fit_velocity,
@@ -25,6 +26,7 @@ from uw_dslam_ros2.core.doctor.fits import (
 )
 from uw_dslam_ros2.core.doctor.images import judge_images
 from uw_dslam_ros2.core.doctor.imu import ImuState, compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.odometry import OdometrySample, examine_odometry
 from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
 from uw_dslam_ros2.core.doctor.scales import confidence_in, judge_scale
@@ -38,12 +40,16 @@ _SURE = 0.99
 _LIKELY = 0.95  # enough to tell of a late dvl, not to correct it
 _MIN_MOTIONS = 15
 _MIN_READINGS = 20
-_MAX_TURN_COST = 1.5
 _MIN_OFFSET_RAD = math.radians(4.0)
 _MIN_DRIFT_RAD_S = math.radians(0.05)
 
 
-def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "") -> Examination:
+def examine(
+    navigation: NavigationSample,
+    pings: PingSample,
+    vehicle_id: str = "",
+    odometry: OdometrySample | None = None,
+) -> Examination:
     """Try the conventions of one vehicle's sensors.
 
     `pings` are bursts: each but the last of a burst has another about a second later.
@@ -52,13 +58,21 @@ def examine(navigation: NavigationSample, pings: PingSample, vehicle_id: str = "
     result.has_yaw = bool(np.isfinite(navigation.yaw_rad).any())
     result.has_yaw_rate = bool(np.isfinite(navigation.yaw_rate_rad_s).any())
     judge_images(result, pings, vehicle_id)
-    if len(navigation.imu_s) < _MIN_READINGS:
+    has_imu = len(navigation.imu_s) >= _MIN_READINGS
+    has_odometry = odometry is not None and len(odometry.stamp_s) >= _MIN_READINGS
+    if not has_imu and not has_odometry:
+        return result
+    motions = ping_motions(pings, 0.7, 2.1)
+    result.num_ping_motions = len(motions)
+    if odometry is not None and has_odometry:
+        examine_odometry(
+            result, odometry, motions, pings.T_base_sonar, vehicle_id, is_alone=not has_imu
+        )
+    if not has_imu:
         return result
     imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
     judge_imu(result, imu, vehicle_id)
     navigation = without_zeros(result, navigation, vehicle_id)
-    motions = ping_motions(pings, 0.7, 2.1)
-    result.num_ping_motions = len(motions)
     if len(motions) >= _MIN_MOTIONS:
         _Trial(result, navigation, imu, motions, pings, vehicle_id).run()
     return result
@@ -101,9 +115,9 @@ class _Trial:
         if imu.by_rates is not None:
             in_degrees = self._result.conventions.imu_rates_in_degrees
             by_rates = imu.by_rates * (math.pi / 180.0 if in_degrees else 1.0)
-            rates = self._believed(fit_turns(self._motions, imu_s, by_rates))
+            rates = believed(fit_turns(self._motions, imu_s, by_rates))
         if imu.by_orientation is not None:
-            orientation = self._believed(fit_turns(self._motions, imu_s, imu.by_orientation))
+            orientation = believed(fit_turns(self._motions, imu_s, imu.by_orientation))
         fits = rates or orientation
         if fits is None:
             return
@@ -131,11 +145,6 @@ class _Trial:
             if not fit.is_mirrored:
                 self._judge_offset(fit)
             judge_scale(self._result, fit, self._vehicle_id)
-
-    def _believed(self, fits: list[TurnFit]) -> list[TurnFit] | None:
-        best, other = fits[0], fits[1]
-        is_close = float(np.mean(best.cost)) < _MAX_TURN_COST
-        return fits if is_close and confidence_of(best.cost, other.cost) > _SURE else None
 
     def _fit(self, reading: _Reading, velocity_delay_s: float = 0.0) -> VelocityFit | None:
         assert self._yaw is not None

@@ -16,6 +16,7 @@ __all__ = [
     "TurnFit",
     "VelocityFit",
     "at_times",
+    "believed",
     "confidence_of",
     "fit_turns",
     "fit_velocity",
@@ -31,6 +32,8 @@ _FLOOR_M = 0.01
 _STEP_S = 0.02
 _MAX_GAP_S = 1.5
 _ITERATIONS = 12
+_SURE = 0.99
+_MAX_TURN_COST = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,6 +126,14 @@ def fit_turns(
     fits.sort(key=lambda fit: float(fit.cost.sum()))
     still = _turn_cost(motions, imu_s, yaw_rad, fits[0].sign, 0.0)
     return [*fits, TurnFit(fits[0].sign, 0.0, still)]
+
+
+def believed(fits: list[TurnFit]) -> list[TurnFit] | None:
+    """Fits of `fit_turns` where the best is close, and surely better than the other sign's."""
+    best, other = fits[0], fits[1]
+    if not len(best.cost) or float(np.mean(best.cost)) > _MAX_TURN_COST:
+        return None
+    return fits if confidence_of(best.cost, other.cost) > _SURE else None
 
 
 def turn_bias(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,10 @@ def read_odometry(msg: Any, settings: ReadSettings) -> Sequence[Reading]:
         is_filled = np.isfinite(velocity).all() and velocity.any()
         pose = readings[0]
         return (
-            PoseEvent(
-                *key_of(msg, settings),
-                str(msg.child_frame_id),
-                pose.T_frame_base,
-                pose.covariance,
-                velocity if is_filled else None,
+            replace(
+                pose,
+                child_frame_id=str(msg.child_frame_id),
+                velocity_m_s=velocity if is_filled else None,
             ),
         )
     return readings
@@ -66,7 +65,8 @@ def _readings(
         return (FixEvent(*key, position[:2], _filled(values, np.ix_([0, 1], [0, 1]))),)
     if _is_unset(pose, position):
         return ()
-    return (PoseEvent(*key, "", planar_pose(pose), _filled(values, _XY_YAW)),)
+    height_m = float(position[2])
+    return (PoseEvent(*key, "", planar_pose(pose), _filled(values, _XY_YAW), height_m=height_m),)
 
 
 def _is_unset(pose: Any, position: FloatArray) -> bool:
