@@ -1,8 +1,8 @@
-"""Bursts show the turns and the whole recording, and more of them are asked for where few tell."""
+"""Bursts show the turns and the whole recording; more pings are taken where some tell."""
 
 import numpy as np
 
-from uw_dslam_ros2.core.doctor.bursts import choose_pings, more_bursts
+from uw_dslam_ros2.core.doctor.bursts import choose_pings, more_pings
 
 PINGS_S = np.arange(0.0, 600.0, 0.33)
 IMU_S = np.arange(0.0, 600.0, 0.05)
@@ -18,15 +18,36 @@ def test_turns_and_the_whole_recording_are_looked_at():
     assert len(chosen) <= 36 * 4
 
 
-def test_more_bursts_are_taken_only_where_they_lie_apart():
-    assert more_bursts(PINGS_S, 0.9) == 0
-    assert more_bursts(PINGS_S[PINGS_S < 120.0], 0.3) == 0
-    assert more_bursts(PINGS_S, 0.3) == 108
-    assert more_bursts(PINGS_S[PINGS_S < 300.0], 0.3) == 74
-    assert more_bursts(PINGS_S[:0], 0.3) == 0
-    rate = np.sin(IMU_S)
-    few, many = (choose_pings(PINGS_S, IMU_S, rate, n) for n in (36, 108))
-    assert len(many) > 2.5 * len(few)
+def looked_at(pings_s):
+    return pings_s[choose_pings(pings_s, IMU_S, np.sin(IMU_S))]
+
+
+def test_more_pings_are_taken_where_those_nearby_have_echoes():
+    seen = looked_at(PINGS_S)
+    further = PINGS_S[more_pings(PINGS_S, seen, seen > 450.0)]
+    assert len(further) > 1.5 * len(seen)
+    assert further.min() > 430.0
+    assert not np.isin(further, seen).any()
+    assert np.histogram(further, 5, (450.0, 600.0))[0].min() > 30
+    anywhere = more_pings(PINGS_S, seen, np.arange(len(seen)) % 2 == 0)
+    assert len(anywhere) + len(seen) <= 432
+
+
+def test_a_short_recording_shows_more_between_the_pings_seen():
+    short = PINGS_S[PINGS_S < 150.0]
+    seen = looked_at(short)
+    further = short[more_pings(short, seen, (seen > 60.0) & (seen < 100.0))]
+    assert len(further) > 60
+    assert np.diff(further).min() >= 0.25
+    assert 55.0 < further.min() < further.max() < 105.0
+
+
+def test_no_more_pings_are_taken_where_most_tell_or_none_does():
+    seen = looked_at(PINGS_S)
+    assert len(more_pings(PINGS_S, seen, np.arange(len(seen)) % 10 > 1)) == 0
+    assert len(more_pings(PINGS_S, seen, np.zeros(len(seen), bool))) == 0
+    assert len(more_pings(PINGS_S[:0], PINGS_S[:0], np.zeros(0, bool))) == 0
+    assert len(more_pings(PINGS_S, PINGS_S[:1], np.ones(1, bool))) == 0
 
 
 def test_pings_too_seldom_show_nothing():

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, SampleCollector, examine
-from uw_dslam_ros2.core.doctor.bursts import choose_pings, more_bursts
-from uw_dslam_ros2.core.doctor.ping_motion import share_with_echoes
+from uw_dslam_ros2.core.doctor.bursts import choose_pings, more_pings
+from uw_dslam_ros2.core.doctor.ping_motion import have_echoes
 from uw_dslam_ros2.core.doctor.turning_verdict import choose_spans, examine_turning
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
@@ -107,10 +107,10 @@ def examine_readings(
         chosen = choose_pings(ping_s, turn_s, rates)
         wanted = {int(stamp_ns) for stamp_ns in ping_ns[chosen]}
         collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in wanted)
-        share = share_with_echoes(collector.pings())
-        if not collector.is_turning and (num_bursts := more_bursts(ping_s, share)):
-            chosen = choose_pings(ping_s, turn_s, rates, num_bursts)
-            more = {int(stamp_ns) for stamp_ns in ping_ns[chosen]} - wanted
+        seen = collector.pings()
+        further = more_pings(ping_s, seen.stamp_s, have_echoes(seen))
+        if not collector.is_turning and len(further):
+            more = {int(stamp_ns) for stamp_ns in ping_ns[further]} - wanted
             collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in more)
     found = examine(collector.navigation(), collector.pings(), vehicle_id, odometry)
     if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):

@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.doctor.sample import PingSample
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["PingMotions", "ping_motions", "share_with_echoes"]
+__all__ = ["PingMotions", "have_echoes", "ping_motions"]
 
 FloatArray = NDArray[np.float64]
 
@@ -46,10 +46,9 @@ class PingMotions:
         return np.asarray(np.linalg.inv(self.information + weak))
 
 
-def share_with_echoes(pings: PingSample) -> float:
-    """Which share of the pings has enough echoes to be matched; 1 where there is no ping."""
-    enough = [len(points) >= _MIN_POINTS for points in pings.points]
-    return float(np.mean(enough)) if enough else 1.0
+def have_echoes(pings: PingSample) -> NDArray[np.bool_]:
+    """Which of the pings (P,) have enough echoes to be matched."""
+    return np.array([len(points) >= _MIN_POINTS for points in pings.points], np.bool_)
 
 
 def ping_motions(pings: PingSample, min_gap_s: float, max_gap_s: float) -> PingMotions:
