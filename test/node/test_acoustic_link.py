@@ -90,12 +90,12 @@ def test_each_vehicle_gets_the_others_submaps_and_its_own_as_they_have_it(fleet,
         for number in (1, 2):
             send(room_submap(f"auv_{number}", 0, T_odom_submap=SE2(1.0, number, 0.5)))
         until(lambda: all(len(known) == 2 for known in got.values()), "two submaps each")
-        until(lambda: all(s.revision == Layer.MEDIUM for k in got.values() for s in k.values()))
+        until(lambda: all(s.revision == Layer.FINE for k in got.values() for s in k.values()))
     for key in (("auv_1", 0), ("auv_2", 0)):
         mine, theirs = got[1][key], got[2][key]
         np.testing.assert_array_equal(mine.grid.values, theirs.grid.values)
         assert mine.T_odom_submap == theirs.T_odom_submap
-        assert mine.grid.spec.resolution_m == pytest.approx(0.2)
+        assert mine.grid.spec.resolution_m == pytest.approx(0.1)
 
 
 def test_a_link_goes_on_where_it_was_stopped(ros_context, spinning, tmp_path):
@@ -174,7 +174,7 @@ def test_a_killed_link_has_all_that_it_received_and_asks_for_nothing_again(
     state = str(tmp_path / "link.json")
     with fleet(state=state) as (until, send, got):
         send(room_submap("auv_1", 0))
-        until(lambda: got[2] and got[2]["auv_1", 0].revision == Layer.MEDIUM, "the submap")
+        until(lambda: got[2] and got[2]["auv_1", 0].revision == Layer.FINE, "the submap")
         before = fleet.links[1]._link.to_state()
         until(lambda: fleet.links[1]._is_changed is False, "what was received on the disk")
     again = make_link(ros_context, 2, state=state)

@@ -49,8 +49,8 @@ class Talk:
         return self.now_s
 
     def all_know(self, num_submaps):
-        """Whether everybody has so many submaps, in all layers that are sent unasked."""
+        """Whether everybody has so many submaps, in all layers."""
         return all(
-            len(got) == num_submaps and all(s.revision % 4 >= Layer.MEDIUM for s in got.values())
+            len(got) == num_submaps and all(s.revision % 4 >= Layer.FINE for s in got.values())
             for got in self.got.values()
         )

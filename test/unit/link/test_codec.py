@@ -25,7 +25,7 @@ def submap(**changes):
     return dataclasses.replace(whole, covariance=COVARIANCE, **changes)
 
 
-LAYERS = encode_submap(submap(), finest=Layer.FINE)
+LAYERS = encode_submap(submap())
 
 
 def received(last, key=b"", layers=LAYERS):
@@ -55,9 +55,7 @@ def test_an_outline_stays_small_far_away():
     assert len(encode_submap(far)[Layer.OUTLINE]) <= 56
 
 
-@pytest.mark.parametrize(
-    ("layer", "resolution_m"), [(Layer.COARSE, 0.3), (Layer.MEDIUM, 0.2), (Layer.FINE, 0.1)]
-)
+@pytest.mark.parametrize(("layer", "resolution_m"), [(Layer.COARSE, 0.3), (Layer.FINE, 0.1)])
 def test_each_layer_shows_the_same_place(layer, resolution_m):
     got = received(layer).submap("auv_1")
     assert got.grid.spec.resolution_m == pytest.approx(resolution_m)
@@ -88,10 +86,10 @@ def test_there_is_no_submap_before_both_outline_and_cells():
 
 
 def test_a_finer_layer_needs_the_one_below():
-    held = received(Layer.COARSE)
-    with pytest.raises(InvalidInputError, match="FINE builds on COARSE"):
+    held = received(Layer.OUTLINE)
+    with pytest.raises(InvalidInputError, match="FINE builds on none"):
         held.add(LAYERS[Layer.FINE])
-    assert held.cells.layer is Layer.COARSE
+    assert held.cells is None
 
 
 def test_walls_told_exactly_leave_free_space_on_the_side_that_was_seen():
@@ -114,18 +112,18 @@ def test_finer_layers_show_the_walls_that_the_map_has():
 
 def test_a_pose_that_moved_costs_an_outline_and_no_cells():
     moved = submap(revision=3, T_odom_submap=SE2(5.0, 6.0, 0.5))
-    held = received(Layer.MEDIUM)
+    held = received(Layer.FINE)
     layers = encode_submap(moved)
     assert layers[Layer.COARSE] == LAYERS[Layer.COARSE]
     held.add(layers[Layer.OUTLINE])
     got = held.submap("auv_1")
-    assert (got.T_odom_submap.x, got.revision) == (pytest.approx(5.0), 4 * 3 + Layer.MEDIUM)
+    assert (got.T_odom_submap.x, got.revision) == (pytest.approx(5.0), 4 * 3 + Layer.FINE)
     held.add(LAYERS[Layer.OUTLINE])  # an older one comes late
     assert held.submap("auv_1").T_odom_submap.x == pytest.approx(5.0)
 
 
 def test_sender_and_receiver_have_the_same_bytes():
-    a, b = received(Layer.MEDIUM).submap("a"), received(Layer.MEDIUM).submap("a")
+    a, b = received(Layer.FINE).submap("a"), received(Layer.FINE).submap("a")
     assert a.grid.values.tobytes() == b.grid.values.tobytes()
     assert a.trajectory.tobytes() == b.trajectory.tobytes()
 
@@ -181,7 +179,7 @@ def test_a_vehicle_that_never_moved_has_a_path_too():
 
 def test_a_map_without_anything_known_can_be_sent():
     empty = OccupancyMap(GridSpec(0.05, 40, 30), np.full((40, 30), -1, np.int8))
-    got = received(Layer.FINE, layers=encode_submap(submap(grid=empty), finest=Layer.FINE))
+    got = received(Layer.FINE, layers=encode_submap(submap(grid=empty)))
     assert not got.submap("auv_1").grid.known.any()
 
 
@@ -200,7 +198,7 @@ def test_turned_grids_and_odd_cells_are_drawn_anew(spec):
 
 def test_large_cells_stay_as_they_are():
     large = OccupancyMap(GridSpec(0.25, 90, 130), places.room_map().values)
-    got = received(Layer.FINE, layers=encode_submap(submap(grid=large), finest=Layer.FINE))
+    got = received(Layer.FINE, layers=encode_submap(submap(grid=large)))
     assert got.submap("auv_1").grid.spec.resolution_m == pytest.approx(0.25)
 
 
@@ -244,7 +242,7 @@ def test_noise_is_refused(data):
 
 def test_another_version_is_refused():
     other = bytes([LAYERS[Layer.COARSE][0] + 4]) + LAYERS[Layer.COARSE][1:]
-    with pytest.raises(InvalidInputError, match="version of the codec is 3, expected 2"):
+    with pytest.raises(InvalidInputError, match="version of the codec is 4, expected 3"):
         LayeredSubmap().add(other)
 
 

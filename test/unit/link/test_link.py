@@ -11,7 +11,7 @@ from unit.link.talk import Talk
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
-from uw_dslam_ros2.core.link import AcousticLink, Layer, LayerKey, LinkConfig
+from uw_dslam_ros2.core.link import AcousticLink, Layer, LinkConfig
 from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -151,37 +151,9 @@ def test_what_was_overtaken_need_not_arrive():
         talk.run(talk.now_s + 6.0)
     talk.until_all_know(1, 300.0)
     talk.run(talk.now_s + 200.0)
-    assert talk.got[2][own_submap(1, 0).submap_id].revision == 4 * 4 + Layer.MEDIUM
+    assert talk.got[2][own_submap(1, 0).submap_id].revision == 4 * 4 + Layer.FINE
     assert talk.links[2].is_complete
     assert talk.links[1].num_open(talk.now_s) == 0
-
-
-def test_detail_comes_where_it_is_asked_for():
-    talk = fleet(loss=0.2)
-    talk.until_all_know(6, 300.0)
-    key = LayerKey.of(77, 1, Layer.FINE)
-    talk.links[2].ask(3, key)
-    talk.run(talk.now_s + 120.0)
-    asked = own_submap(3, 1).submap_id
-    sizes = {n: got[asked].grid.spec.resolution_m for n, got in talk.got.items()}
-    assert sizes == pytest.approx({1: 0.1, 2: 0.1, 3: 0.1})  # all overhear it, the owner too
-    others = [s.grid.spec.resolution_m for i, s in talk.got[1].items() if i != asked]
-    assert others == pytest.approx([0.2] * 5)
-    assert same_everywhere(talk)
-
-
-def test_what_is_here_already_is_not_asked_for():
-    talk = fleet(num=2)
-    key = LayerKey.of(77, 1, Layer.FINE)
-    talk.until_all_know(4, 200.0)
-    talk.links[2].ask(1, key)
-    assert talk.links[2].num_asked == 1
-    talk.run(talk.now_s + 60.0)
-    talk.links[2].ask(1, key)
-    assert talk.links[2].num_asked == 0
-    before = len(talk.packets)
-    talk.run(talk.now_s + 600.0)
-    assert len(talk.packets) - before <= 2 * 11  # a sign of life each minute
 
 
 def test_a_restarted_link_has_lost_nothing_and_sends_nothing_again():

@@ -1,7 +1,6 @@
 import pytest
 from unit.merging.fleet import map_bytes, three_vehicles
 
-from uw_dslam_ros2.core.link import Layer
 from uw_dslam_ros2.core.link.transport.channel import ChannelConfig
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
@@ -49,20 +48,6 @@ def test_half_the_mission_in_blackout_changes_nothing_in_the_end():
         assert (run.channel.blacked_out > 0) == bool(blackouts)
         maps |= {map_bytes(queue_of(events, fleet, False)) for events in run.known.values()}
     assert len(maps) == 1
-
-
-def test_detail_comes_for_what_is_asked():
-    fleet = three_vehicles(num_submaps=2)
-    details = {("auv_2", 0, 1)}
-    run = run_link(list(fleet.submaps.values()), ChannelConfig(), limit_s=600.0, details=details)
-    wanted = {i: 4 * s.revision + Layer.MEDIUM for i, s in fleet.submaps.items()}
-    wanted[next(iter(details))] = Layer.FINE
-    done_s = run.complete_s(wanted)
-    assert done_s is not None
-    assert run.complete_s(wanted | {("auv_1", 0, 0): Layer.FINE}) is None
-    finest = {n: max(s.revision for _, s in events) for n, events in run.known.items()}
-    assert set(finest.values()) == {Layer.FINE}
-    assert sum(c.duplicates for c in run.counts.values()) == 0
 
 
 def test_nobody_knows_a_submap_before_it_is_closed():

@@ -28,7 +28,6 @@ _SETTLE_TIMEOUT_S = 600.0
 _LINK_PATIENCE_S = 1800.0  # of recorded time, after the last ping
 _CLOCK_HZ = 2.0
 _MAX_LAG_S = 20.0
-_OPEN = "items to send", "layers asked for"
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,11 +175,9 @@ class _Run:
         )
 
     def _is_at_rest(self) -> bool:
-        """Whether that is so, and no link has anything left to send or to ask for."""
+        """Whether that is so, and no link has anything left to send."""
         links = [control.diagnostics_of("acoustic_link") for control in self._controls[:-1]]
-        return self._is_complete() and {link.get(name) for link in links for name in _OPEN} == {
-            "0"
-        }
+        return self._is_complete() and all(link.get("items to send") == "0" for link in links)
 
     def _settle(self, end_s: float) -> tuple[float | None, bool]:
         """When every manager knew every submap, if ever; and whether all came to rest."""
@@ -197,7 +194,7 @@ class _Run:
             for control in self._controls[:-1]:
                 control.wait_until_settled(_SETTLE_TIMEOUT_S, lambda _: None)
             self._look()
-            # What was found now may have been worth asking for detail, which crosses the link yet.
+            # What was found now are answers, which cross the link yet.
             if self._is_at_rest() and self._known[0].revisions == before:
                 return complete_s, True
         return complete_s, False

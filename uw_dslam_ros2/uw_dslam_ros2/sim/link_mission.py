@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from uw_dslam_ros2.core.link import AcousticLink, Layer, LayerKey, LinkConfig, LinkCounts
+from uw_dslam_ros2.core.link import AcousticLink, Layer, LinkConfig, LinkCounts
 from uw_dslam_ros2.core.link.transport.channel import ChannelConfig, ChannelCounts, SharedChannel
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
@@ -45,7 +45,6 @@ def run_link(
     *,
     limit_s: float,
     blackouts: Sequence[tuple[float, float]] = (),
-    details: Collection[SubmapId] = (),
     config: LinkConfig | None = None,
 ) -> LinkRun:
     """Let vehicles exchange their submaps, each from the time of its last ping on.
@@ -60,9 +59,6 @@ def run_link(
         After the last ping: when to stop, if not everything has come before.
     blackouts
         Times (begin, end) from the mission's beginning in which nothing arrives.
-    details
-        Submaps whose walls in cells of 0.1 m the first vehicle asks for as soon as it has coarse
-        ones.
     config
         Of the links; the number and the packets' size are set here.
     """
@@ -77,18 +73,11 @@ def run_link(
     begin_ns = min(int(s.trajectory_stamp_ns[0]) for s in submaps)
     pending = sorted(((s.stamp_ns - begin_ns) * 1e-9, s.submap_id, s) for s in submaps)
     run = LinkRun(pending[-1][0], {name: [] for name in names})
-    asked: set[SubmapId] = set()
-    layers = {s.submap_id: Layer.FINE if s.submap_id in details else Layer.MEDIUM for s in submaps}
-    wanted = {s.submap_id: 4 * s.revision + layers[s.submap_id] for s in submaps}
+    wanted = {s.submap_id: 4 * s.revision + Layer.FINE for s in submaps}
     turns = {number: water.next_turn(number, 0.0) for number in links}
 
     def note(number: int, at_s: float, found: Sequence[Submap]) -> None:
         run.known[names[number - 1]] += [(at_s, submap) for submap in found]
-        for submap in found if number == 1 else ():
-            if submap.submap_id in details and submap.submap_id not in asked:
-                asked.add(submap.submap_id)
-                key = LayerKey.of(submap.run_id, submap.sequence, Layer.FINE)
-                note(number, at_s, links[1].ask(names.index(submap.vehicle_id) + 1, key))
 
     while (now_s := min(turns.values())) < run.end_s + limit_s:
         number = min(turns, key=lambda n: (turns[n], n))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,18 +30,17 @@ from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission, demo_mission
 from uw_dslam_ros2.cli.studies.merging import merged_largest, placing_error
 from uw_dslam_ros2.core.link import Layer, LayeredSubmap, encode_submap
 from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig
-from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.sim.link_mission import LinkRun, run_link
 
 __all__ = ["add_arguments", "run"]
 
 _LIMIT_S = 3600.0
-_CELLS = Layer.COARSE, Layer.MEDIUM, Layer.FINE
+_CELLS = Layer.COARSE, Layer.FINE
 _WAYS = {
     "full grids": None,
     "0.3 m": Layer.COARSE,
-    "0.3 m, walls of 0.2 m": Layer.MEDIUM,
-    "0.3 m, walls of 0.1 m where joined": Layer.FINE,
+    "0.3 m, walls of 0.1 m": Layer.FINE,
 }
 _CLOUD_BYTES, _DESCRIPTOR_BYTES = 9000 // 8, 16
 _SHARED_RATE = 1500.0  # while a modem sends; 1000 bit/s with the pauses of 64-byte packets
@@ -64,18 +63,16 @@ def run(args: argparse.Namespace) -> int:
     for seed in progress(range(args.first_seed, args.first_seed + args.seeds), text="missions"):
         mission = demo_mission(seed, args.out / "cache")
         sizes += [_sizes(mission.name, submap) for submap in mission.submaps]
-        found, details = ([], set()) if args.no_merging else _merged_rows(mission)
-        merged += found
+        merged += [] if args.no_merging else _merged_rows(mission)
         for name, (channel, blackouts) in _channels(args.loss, mission.submaps).items():
             played = run_link(
                 mission.submaps,
                 dataclasses.replace(channel, seed=seed),
                 limit_s=_LIMIT_S,
                 blackouts=blackouts,
-                details=details,
             )
             runs.setdefault(name, played)
-            rows.append(_row(mission, name, played, details))
+            rows.append(_row(mission, name, played))
     write_csv(args.out / "link.csv", rows)
     write_csv(args.out / "sizes.csv", sizes)
     _draw_known(runs, args.out / "link.png")
@@ -107,29 +104,20 @@ def _channels(
 
 
 def _sizes(mission: str, submap: Submap) -> dict[str, Any]:
-    layers = encode_submap(submap, finest=Layer.FINE)
+    layers = encode_submap(submap)
     return {"mission": mission, "submap": str(submap.submap_id)} | {
         layer.name.lower(): len(data) for layer, data in layers.items()
     }
 
 
-def _after_s(
-    played: LinkRun, submaps: Sequence[Submap], ids: Collection[SubmapId], layer: Layer
-) -> float | str:
-    """How long after the last ping everybody had these submaps down to a layer; "": never."""
-    wanted = {s.submap_id: 4 * s.revision + layer for s in submaps if s.submap_id in ids}
-    done_s = played.complete_s(wanted) if wanted else None
+def _after_s(played: LinkRun, submaps: Sequence[Submap], layer: Layer) -> float | str:
+    """How long after the last ping everybody had all submaps down to a layer; "": never."""
+    done_s = played.complete_s({s.submap_id: 4 * s.revision + layer for s in submaps})
     return "" if done_s is None else round(done_s - played.end_s, 1)
 
 
-def _row(
-    mission: FleetMission, name: str, played: LinkRun, details: set[SubmapId]
-) -> dict[str, Any]:
-    every = {submap.submap_id for submap in mission.submaps}
-    after_s = {
-        layer: _after_s(played, mission.submaps, every if layer < Layer.FINE else details, layer)
-        for layer in _CELLS
-    }
+def _row(mission: FleetMission, name: str, played: LinkRun) -> dict[str, Any]:
+    after_s = {layer: _after_s(played, mission.submaps, layer) for layer in _CELLS}
     sent: dict[str, int] = {}
     for counts in played.counts.values():
         for label, num in counts.sent_bytes.items():
@@ -150,23 +138,15 @@ def _row(
     }
 
 
-def _merged_rows(mission: FleetMission) -> tuple[list[dict[str, Any]], set[SubmapId]]:
-    """The map of full grids beside that of each layer, for everybody who has it all.
-
-    Also the submaps of vehicles that are joined: whose detail is worth asking for.
-    """
+def _merged_rows(mission: FleetMission) -> list[dict[str, Any]]:
+    """The map of full grids beside that of each layer, for everybody who has it all."""
     found: list[dict[str, Any]] = []
-    details: set[SubmapId] = set()
     for name, layer in _WAYS.items():
         crossed = []
         for submap in mission.submaps:
-            is_alone = layer is Layer.FINE and submap.submap_id not in details
-            finest = Layer.MEDIUM if is_alone else layer
-            crossed.append((submap, 0) if finest is None else _crossed(submap, finest))
+            crossed.append((submap, 0) if layer is None else _crossed(submap, layer))
         sent = FleetMission(mission.name, tuple(pair[0] for pair in crossed), mission.truth)
         placing, _ = merged_largest(sent)
-        if layer is Layer.MEDIUM and len({i.vehicle_id for i in placing}) > 1:
-            details = set(placing)
         num_bytes = sum(pair[1] for pair in crossed)
         found.append(
             {
@@ -175,10 +155,9 @@ def _merged_rows(mission: FleetMission) -> tuple[list[dict[str, Any]], set[Subma
                 "kB": round(num_bytes / 1000, 1) if num_bytes else "",
                 "vehicles": len({submap_id.vehicle_id for submap_id in placing}),
                 "rmse_m": round(placing_error(sent, placing), 3),
-                "detailed": len(details) if layer is Layer.FINE else "",
             }
         )
-    return found, details
+    return found
 
 
 def _crossed(submap: Submap, finest: Layer) -> tuple[Submap, int]:
@@ -252,8 +231,10 @@ def _report(rows: Sequence[Mapping[str, Any]]) -> None:
         )
     num = np.median([row["submaps"] for row in rows])
     print_table(
-        ["channel", "cells of 0.3 m: s after the last ping, median, most", "walls of 0.2 m",
-         "of 0.1 m", "kB", "packets", "repairs", "duplicates"],
+        [
+            "channel", "cells of 0.3 m: s after the last ping, median, most", "walls of 0.1 m",
+            "kB", "packets", "repairs", "duplicates",
+        ],
         table,
     )  # fmt: skip
     draco = num * (_DESCRIPTOR_BYTES + _CLOUD_BYTES) / 1000

@@ -19,7 +19,6 @@ from uw_dslam_ros2.core.link.coding.codec import (
 )
 from uw_dslam_ros2.core.link.coding.fields import ByteReader
 from uw_dslam_ros2.core.link.coding.items import (
-    Ask,
     ItemKind,
     LayerKey,
     PeerReport,
@@ -43,14 +42,11 @@ _OUTLINE_RANK, _CELLS_RANK, _ANSWER_RANK, _MOVED_RANK = 0.0, 1.0, 1.5, 1.8
 _LAYER_RANKS = {
     Layer.OUTLINE: _OUTLINE_RANK,
     Layer.COARSE: _CELLS_RANK,
-    Layer.MEDIUM: 2.0,
-    Layer.FINE: 3.0,
+    Layer.FINE: 2.0,
 }
-"""The lower, the sooner. Walls of 0.2 m of all come before those of 0.1 m of any."""
-_UNASKED = Layer.MEDIUM  # the finest layer that is sent of every submap
+"""The lower, the sooner."""
 _PACKETS_PER_STATUS = 12  # between two reports while there is something else to send
 _HASTE = 0.3  # who has nothing else to say reports that much sooner
-_MAX_ASKS = 4
 _MAX_UNANSWERED = 10
 
 
@@ -80,12 +76,11 @@ class AcousticLink:
         self._held: dict[tuple[int, int, int], LayeredSubmap] = {}
         self._waiting: dict[tuple[int, LayerKey], bytes] = {}  # finer layers that came too early
         self._given: dict[tuple[int, int, int], int] = {}  # revision of the submap given out
-        self._asks: dict[tuple[int, LayerKey], None] = {}
         self._answers: list[bytes] = []
         self._heard_s: dict[int, float] = {}
         self._news, self._last_status_s, self._num_reports = 0, -1e9, 0
         self._num_unanswered = 0  # reports since there was anything new
-        self._num_since_status, self._is_curious = _PACKETS_PER_STATUS, False
+        self._num_since_status = _PACKETS_PER_STATUS
         self._outbox.add(hello_item(name), _OUTLINE_RANK, "hello")
 
     # --- own submaps -------------------------------------------------------------------------
@@ -96,12 +91,10 @@ class AcousticLink:
             raise InvalidInputError(
                 f"submap of {submap.vehicle_id!r} on the link of {self._name!r}"
             )
-        layers = encode_submap(submap, self._key, _UNASKED)
+        layers = encode_submap(submap, self._key)
         self._sources[submap.run_id & 0xFFFF, submap.sequence] = submap
-        for layer in Layer:
-            if layer > _UNASKED:
-                break
-            self._say(LayerKey.of(submap.run_id, submap.sequence, layer), layers[layer])
+        for layer, data in layers.items():
+            self._say(LayerKey.of(submap.run_id, submap.sequence, layer), data)
         self._rank_cells()
         return self._improved(self._config.number)
 
@@ -128,17 +121,6 @@ class AcousticLink:
         key = LayerKey.of(submap.run_id, submap.sequence, Layer.OUTLINE)
         self._say(key, write_outline(outline, self._key))
         return self._improved(self._config.number)
-
-    def ask(self, sender: int, key: LayerKey) -> list[Submap]:
-        """Want a finer layer of a submap; of an own one it is sent, for others need it then."""
-        if sender == self._config.number:
-            self._offer(key)
-            return self._improved(sender)
-        held = self._held.get((sender, key.run, key.sequence))
-        if held is None or held.cells is None or held.cells.layer < key.layer:
-            self._asks[sender, key] = None
-            self._is_curious = True
-        return []
 
     def add_answer(self, answer: bytes) -> None:
         """Tell the others the answer to a question; see `answers`.
@@ -191,15 +173,6 @@ class AcousticLink:
             likeness = [outline.likeness(other) for other in others if other is not None]
             item.rank = _CELLS_RANK + 0.4 / (1.0 + 0.1 * max(likeness, default=0.0))
 
-    def _offer(self, key: LayerKey) -> None:
-        """Send a finer layer, and those below it; nothing where the full map is not here."""
-        submap = self._sources.get((key.run, key.sequence))
-        if key in self._own or submap is None:
-            return
-        for layer, data in encode_submap(submap, self._key, key.layer).items():
-            if layer > _UNASKED:
-                self._say(LayerKey(key.run, key.sequence, layer), data)
-
     # --- packets out -------------------------------------------------------------------------
 
     def next_packet(self, now_s: float) -> bytes | None:
@@ -208,7 +181,7 @@ class AcousticLink:
         item = self._outbox.next_item(peers)
         notes: list[bytes] = []
         if self._is_status_due(now_s, item is None):
-            notes = self._report(now_s, peers)
+            notes = [self._report(now_s, peers)]
         while note := self._outbox.take_whole(self._room - len(bundled(notes)), peers):
             notes.append(note)
         if not notes:
@@ -237,11 +210,6 @@ class AcousticLink:
         return self._outbox.num_open(self._peers(now_s))
 
     @property
-    def num_asked(self) -> int:
-        """Layers of others that are wanted and have not come."""
-        return len(self._asks)
-
-    @property
     def is_complete(self) -> bool:
         """Whether all that the others are known to have said is here."""
         return all(inbox.is_complete for inbox in self._inboxes.values())
@@ -265,11 +233,11 @@ class AcousticLink:
         if not is_idle:
             # Turns that items wait for are not spent on reports alone.
             is_time = self._num_since_status >= _PACKETS_PER_STATUS
-            return is_time and (self._is_curious or self._news > 0 or not self.is_complete)
-        if self._is_curious or (self._news and since_s >= _HASTE * wait_s):
+            return is_time and (self._news > 0 or not self.is_complete)
+        if self._news and since_s >= _HASTE * wait_s:
             return True
-        # A report, a question or the last of what was sent may have been lost.
-        is_open = self._asks or not self.is_complete or self._outbox.is_unheard(self._peers(now_s))
+        # A report or the last of what was sent may have been lost.
+        is_open = not self.is_complete or self._outbox.is_unheard(self._peers(now_s))
         if is_open:
             # Soon once more, then ever more rarely: who does not answer may be far away.
             wait_s *= _HASTE * 2.0**self._num_unanswered
@@ -291,20 +259,15 @@ class AcousticLink:
         reports = {s: self._inboxes[s].report() for s in senders[first:] + senders[:first]}
         return Status(len(self._outbox.items), self._outbox.voids(peers)[:8], reports)
 
-    def _report(self, now_s: float, peers: list[int]) -> list[bytes]:
-        """What has come, and what is wanted, as notes."""
-        has_news = self._news > 0 or self._is_curious
-        self._num_unanswered = 0 if has_news else min(self._num_unanswered + 1, _MAX_UNANSWERED)
-        self._news, self._last_status_s, self._is_curious = 0, now_s, False
+    def _report(self, now_s: float, peers: list[int]) -> bytes:
+        """What has come, as a note."""
+        is_old = self._news == 0
+        self._num_unanswered = min(self._num_unanswered + 1, _MAX_UNANSWERED) if is_old else 0
+        self._news, self._last_status_s = 0, now_s
         status = self._status(peers)
         while len(bundled([status.pack()])) > self._room:
             status = _shortened(status)
-        notes = [status.pack()]
-        for sender, key in list(self._asks)[:_MAX_ASKS]:
-            note = Ask(sender, key).pack()
-            if len(bundled([*notes, note])) <= self._room:
-                notes.append(note)
-        return notes
+        return status.pack()
 
     # --- packets in --------------------------------------------------------------------------
 
@@ -349,7 +312,7 @@ class AcousticLink:
         said = read_note(note)
         if isinstance(said, bytes):
             self._take_found(sender, inbox, inbox.add_whole(said))
-        elif isinstance(said, Status):
+        else:
             inbox.expect(said.num_items, said.voids)
             self._news += not inbox.is_complete  # tell what is lacking
             report = said.peers.get(self._config.number)
@@ -358,8 +321,6 @@ class AcousticLink:
             if report is None or report.epoch != self._epoch:
                 report = PeerReport(self._epoch, 0)
             self._outbox.hear(sender, report)
-        elif said.sender == self._config.number:
-            self._offer(said.key)
 
     def _take_found(self, sender: int, inbox: Inbox, found: tuple[int, bytes] | None) -> None:
         self._news += 1
@@ -409,7 +370,6 @@ class AcousticLink:
         self._held[where] = held
         if key.layer is Layer.OUTLINE and sender != self._config.number:
             self._rank_cells()
-        self._asks.pop((sender, key), None)
         finer = LayerKey(key.run, key.sequence, Layer(min(key.layer + 1, Layer.FINE)))
         if key.layer is not Layer.OUTLINE and (early := self._waiting.pop((sender, finer), None)):
             self._take_layer(sender, finer, early)

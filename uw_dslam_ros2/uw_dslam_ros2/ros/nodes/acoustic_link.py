@@ -13,11 +13,10 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Empty, UInt8MultiArray
-from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
-from uw_dslam_ros2.core.link import AcousticLink, Layer, LayerKey, LinkConfig
+from uw_dslam_ros2.core.link import AcousticLink, LinkConfig
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.link_state import load_link_state, save_link_state
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_id_of, submap_to_msg
@@ -25,7 +24,7 @@ from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
 from uw_dslam_ros2.ros.plumbing.missing_submaps import MissingSubmaps
 from uw_dslam_ros2.ros.plumbing.node_settings import AcousticLinkConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
-from uw_dslam_ros2.ros.plumbing.qos import ANSWERS, LATCHED, MODEM, SUBMAPS
+from uw_dslam_ros2.ros.plumbing.qos import ANSWERS, MODEM, SUBMAPS
 from uw_dslam_ros2.ros.plumbing.running import run_node
 
 __all__ = ["AcousticLinkNode", "main"]
@@ -49,7 +48,6 @@ class AcousticLinkNode(Node):
             )
         self._lock = threading.Lock()
         self._outputs: dict[str, Publisher] = {}
-        self._asked: set[tuple[int, LayerKey]] = set()
         self._is_changed, self._problem = False, ""
         self._link = self._resumed(link_config)
         # Callbacks are short, and the link is one thing: one after the other.
@@ -66,10 +64,6 @@ class AcousticLinkNode(Node):
             callback_group=group,
         )
         self.create_subscription(Empty, "modem/ready", self._on_ready, MODEM, callback_group=group)
-        if self._config.is_detail_asked:
-            self.create_subscription(
-                MergeStatus, "/merge_status", self._on_status, LATCHED, callback_group=group
-            )
         self._answers_heard = self.create_publisher(UInt8MultiArray, "link/answers_heard", ANSWERS)
         self.create_subscription(
             UInt8MultiArray, "link/answers", self._on_answer, ANSWERS, callback_group=group
@@ -162,28 +156,6 @@ class AcousticLinkNode(Node):
         if packet is not None:
             self._modem.publish(UInt8MultiArray(data=packet))
 
-    def _on_status(self, msg: MergeStatus) -> None:
-        """Ask for the detail of all submaps of vehicles that are joined.
-
-        Of all, because maps of several submaps are matched, on the cells of one of them.
-        """
-        members: dict[int, set[str]] = {}
-        for info in msg.submaps:
-            members.setdefault(info.component, set()).add(info.vehicle_id)
-        for info in msg.submaps:
-            if len(members[info.component]) > 1:
-                self._ask(info.vehicle_id, info.run_id, info.sequence)
-
-    def _ask(self, vehicle_id: str, run_id: int, sequence: int) -> None:
-        key = LayerKey.of(run_id, sequence, Layer.FINE)
-        with self._lock:
-            number = self._link.number_of(vehicle_id)
-            if number is None or (number, key) in self._asked:
-                return
-            self._asked.add((number, key))
-            found = self._link.ask(number, key)
-        self._give(found)
-
     # --- out ---------------------------------------------------------------------------------
 
     def _give(self, submaps: Any) -> None:
@@ -228,7 +200,6 @@ class AcousticLinkNode(Node):
                 "vehicles heard": sum(1 for n in range(32) if link.age_s(n, now_s) is not None),
                 "submaps known": sum(1 for _ in link.outlines()),
                 "items to send": link.num_open(now_s),
-                "layers asked for": link.num_asked,
                 "loss": link.loss,
                 "received packets": counts.received_packets,
                 "received bytes": counts.received_bytes,

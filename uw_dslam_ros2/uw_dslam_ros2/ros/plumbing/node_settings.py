@@ -194,10 +194,6 @@ class AcousticLinkConfig(Config):
         "",
         doc="file that outlives a restart with all that was received; empty: none",
     )
-    is_detail_asked: bool = setting(
-        True,
-        doc="ask for walls in cells of 0.1 m of the submaps of vehicles that are joined",
-    )
     time_scale: float = setting(
         1.0, 0.01, 1000.0, "seconds that pass in a second: as that of the simulated channel"
     )

@@ -1,4 +1,4 @@
-"""Cells of three values to few bytes and back: a binary range coder with mixed context models.
+"""Marks on cells to few bytes and back: a binary range coder with mixed context models.
 
 Whole numbers only, so that sender and receiver need not be of one make: every probability comes
 out alike on every processor. The coder is one loop for both ways, which cannot disagree with
@@ -21,14 +21,13 @@ __all__ = [
     "CELL_FREE",
     "CELL_UNKNOWN",
     "CELL_WALL",
-    "decode_cells",
-    "decode_walls",
-    "encode_cells",
-    "encode_walls",
-    "near_walls",
+    "decode_marks",
+    "encode_marks",
+    "near_cells",
 ]
 
 CellArray = NDArray[np.int8]
+BoolArray = NDArray[np.bool_]
 
 CELL_UNKNOWN, CELL_FREE, CELL_WALL = 0, 1, 2
 """Values of cells."""
@@ -63,53 +62,43 @@ def _tables() -> tuple[NDArray[np.int64], ...]:
     return np.array(_STARTS), stretch, np.clip(squash, 1, 65535), rate
 
 
-def encode_cells(cells: CellArray, coarse: CellArray) -> bytes:
-    """Encode cells (R, C); `coarse` (R, C) is what the receiver has of each of them already."""
-    return _encoded(cells, coarse, 2)
+def encode_marks(marks: BoolArray, known: CellArray, is_open: BoolArray | None = None) -> bytes:
+    """Encode which cells (R, C) are marked.
 
-
-def decode_cells(data: bytes, coarse: CellArray) -> CellArray:
-    """Decode what `encode_cells` made with the same `coarse`; of other bytes come other cells."""
-    return _decoded(data, coarse, 2)
-
-
-def near_walls(coarse: CellArray) -> NDArray[np.bool_]:
-    """Which cells (R, C) are at most two from a wall that is known: only there may new ones be."""
-    walls = (coarse == CELL_WALL).astype(np.uint8)
-    return cv2.dilate(walls, np.ones((5, 5), np.uint8)) > 0
-
-
-def encode_walls(walls: NDArray[np.bool_], coarse: CellArray) -> bytes:
-    """Encode which cells (R, C) are walls, where `near_walls`; `coarse` as for `encode_cells`."""
-    return _encoded(walls.astype(np.int8), coarse, 1)
-
-
-def decode_walls(data: bytes, coarse: CellArray) -> NDArray[np.bool_]:
-    """Decode what `encode_walls` made with the same `coarse`."""
-    return _decoded(data, coarse, 1) > 0
-
-
-def _encoded(cells: CellArray, coarse: CellArray, num_bits: int) -> bytes:
-    buffer = np.zeros(4 * cells.size + 16, np.uint8)  # no bit costs more than 16
-    _check(cells, coarse)
+    Parameters
+    ----------
+    marks
+        The marks.
+    known
+        (R, C) what the receiver knows of each cell already.
+    is_open
+        (R, C) where marks may be, which the receiver knows too; everywhere where None.
+    """
+    buffer = np.zeros(2 * marks.size + 16, np.uint8)  # no bit costs more than 16
+    _check(marks, known)
     num_bytes = _code(
-        _framed(cells), *_known(coarse, num_bits), buffer, False, num_bits, *_tables()
+        _framed(marks.astype(np.int8)), *_given(known, is_open), buffer, False, *_tables()
     )
     return bytes(buffer[:num_bytes]).rstrip(b"\0")
 
 
-def _decoded(data: bytes, coarse: CellArray, num_bits: int) -> CellArray:
-    cells = np.zeros(coarse.shape, np.int8)
-    _check(cells, coarse)
-    framed, buffer = _framed(cells), np.frombuffer(bytearray(data), np.uint8)
-    _code(framed, *_known(coarse, num_bits), buffer, True, num_bits, *_tables())
-    return np.ascontiguousarray(framed[_FRAME:-_FRAME, _FRAME:-_FRAME])
+def decode_marks(data: bytes, known: CellArray, is_open: BoolArray | None = None) -> BoolArray:
+    """Decode what `encode_marks` made of the same; of other bytes come other marks."""
+    framed = _framed(np.zeros_like(known))
+    buffer = np.frombuffer(bytearray(data), np.uint8)
+    _code(framed, *_given(known, is_open), buffer, True, *_tables())
+    return np.ascontiguousarray(framed[_FRAME:-_FRAME, _FRAME:-_FRAME] > 0)
 
 
-def _known(coarse: CellArray, num_bits: int) -> tuple[CellArray, CellArray]:
-    """What is known of each cell, and whether more is to be told of it."""
-    is_open = np.ones_like(coarse) if num_bits > 1 else near_walls(coarse).astype(np.int8)
-    return _framed(coarse), _framed(is_open)
+def near_cells(is_there: BoolArray) -> BoolArray:
+    """Which cells (R, C) are at most two from one of those."""
+    return cv2.dilate(is_there.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+
+
+def _given(known: CellArray, is_open: BoolArray | None) -> tuple[CellArray, CellArray]:
+    """What both ends know: of each cell, and whether it may be marked."""
+    open_cells = np.ones_like(known) if is_open is None else is_open.astype(np.int8)
+    return _framed(known), _framed(open_cells)
 
 
 def _framed(cells: CellArray) -> CellArray:
@@ -119,11 +108,11 @@ def _framed(cells: CellArray) -> CellArray:
     return framed
 
 
-def _check(cells: CellArray, coarse: CellArray) -> None:
-    if cells.shape != coarse.shape or cells.ndim != 2:
+def _check(marks: BoolArray, known: CellArray) -> None:
+    if marks.shape != known.shape or marks.ndim != 2:
         raise InvalidInputError(
-            f"cells have shape {cells.shape}, what is known of them {coarse.shape}; expected the "
-            "same two sides"
+            f"marks have shape {marks.shape}, what is known of the cells {known.shape}; expected "
+            "the same two sides"
         )
 
 
@@ -178,20 +167,20 @@ def _learn(probabilities, counts, place, bit, rate):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True)
 def _code(  # type: ignore[no-untyped-def]
-    cells, coarse, is_open, buffer, is_decoding, num_bits, starts, stretch, squash, rate
+    cells, coarse, is_open, buffer, is_decoding, starts, stretch, squash, rate
 ):  # fmt: skip
     """Encode framed cells into the buffer, or decode them from it; returns the bytes used.
 
-    Each takes up to `num_bits` bits: whether it is more than 0, then whether it is more than 1.
+    Each open one takes a bit: whether it is more than 0.
     """
     limit = squash.shape[0] // 2
     models = starts.shape[0] - 1
     size = starts[models]
-    probabilities = np.full(num_bits * size, 32768, np.int32)
-    counts = np.zeros(num_bits * size, np.uint8)
-    plain = np.full(18, 32768, np.int32)
-    plain_counts = np.zeros(18, np.uint8)
-    weights = np.full((2, models, _NUM_SURE), _FIRST_WEIGHT, np.int64)
+    probabilities = np.full(size, 32768, np.int32)
+    counts = np.zeros(size, np.uint8)
+    plain = np.full(9, 32768, np.int32)
+    plain_counts = np.zeros(9, np.uint8)
+    weights = np.full((models, _NUM_SURE), _FIRST_WEIGHT, np.int64)
     context = np.zeros(models, np.int64)
     inputs = np.zeros(models, np.int64)
     sure = np.zeros(models, np.int64)
@@ -205,53 +194,45 @@ def _code(  # type: ignore[no-untyped-def]
             if is_open[row, col] == 0:
                 continue
             alike = _contexts(cells, coarse, row, col, context)
-            value = int(cells[row, col])
-            decoded = 0
-            for step in range(num_bits):
-                if alike >= 0:
-                    chance = max(1, int(plain[step * 9 + alike]))
-                else:
-                    mixed = 0
-                    for k in range(models):
-                        at = step * size + starts[k] + context[k]
-                        inputs[k] = stretch[probabilities[at] >> 4]
-                        count = int(counts[at])
-                        sure[k] = count if count < 4 else (4 if count < 12 else 5)
-                        mixed += weights[step, k, sure[k]] * inputs[k]
-                    chance = squash[max(-limit, min(limit, mixed >> 16)) + limit]
-                span = high - low
-                middle = low + ((span >> 16) * chance + (((span & 0xFFFF) * chance) >> 16))
-                if is_decoding:
-                    bit = 1 if code <= middle else 0
-                else:
-                    bit = (1 if value > 0 else 0) if step == 0 else value - 1
-                if bit == 1:
-                    high = middle
-                else:
-                    low = middle + 1
-                while ((low ^ high) & 0xFF000000) == 0:
-                    if is_decoding:
-                        code = ((code & 0xFFFFFF) << 8) | (
-                            buffer[place] if place < buffer.shape[0] else 0
-                        )
-                    else:
-                        buffer[place] = high >> 24
-                    place += 1
-                    low = (low & 0xFFFFFF) << 8
-                    high = ((high & 0xFFFFFF) << 8) | 255
-                if alike >= 0:
-                    _learn(plain, plain_counts, step * 9 + alike, bit, rate)
-                else:
-                    error = (bit << 16) - chance
-                    for k in range(models):
-                        weights[step, k, sure[k]] += (inputs[k] * error) >> _LEARNING_SHIFT
-                        at = step * size + starts[k] + context[k]
-                        _learn(probabilities, counts, at, bit, rate)
-                decoded += bit
-                if bit == 0:
-                    break
+            if alike >= 0:
+                chance = max(1, int(plain[alike]))
+            else:
+                mixed = 0
+                for k in range(models):
+                    at = starts[k] + context[k]
+                    inputs[k] = stretch[probabilities[at] >> 4]
+                    count = int(counts[at])
+                    sure[k] = count if count < 4 else (4 if count < 12 else 5)
+                    mixed += weights[k, sure[k]] * inputs[k]
+                chance = squash[max(-limit, min(limit, mixed >> 16)) + limit]
+            span = high - low
+            middle = low + ((span >> 16) * chance + (((span & 0xFFFF) * chance) >> 16))
             if is_decoding:
-                cells[row, col] = decoded
+                bit = 1 if code <= middle else 0
+                cells[row, col] = bit
+            else:
+                bit = 1 if cells[row, col] > 0 else 0
+            if bit == 1:
+                high = middle
+            else:
+                low = middle + 1
+            while ((low ^ high) & 0xFF000000) == 0:
+                if is_decoding:
+                    code = ((code & 0xFFFFFF) << 8) | (
+                        buffer[place] if place < buffer.shape[0] else 0
+                    )
+                else:
+                    buffer[place] = high >> 24
+                place += 1
+                low = (low & 0xFFFFFF) << 8
+                high = ((high & 0xFFFFFF) << 8) | 255
+            if alike >= 0:
+                _learn(plain, plain_counts, alike, bit, rate)
+            else:
+                error = (bit << 16) - chance
+                for k in range(models):
+                    weights[k, sure[k]] += (inputs[k] * error) >> _LEARNING_SHIFT
+                    _learn(probabilities, counts, starts[k] + context[k], bit, rate)
     if is_decoding:
         return place
     # As few bytes as name a number between the two, zeros after them.

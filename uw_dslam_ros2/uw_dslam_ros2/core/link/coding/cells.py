@@ -17,7 +17,15 @@ from uw_dslam_ros2.core.link.coding.cell_coder import (
 from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["known_window", "levelled", "occupancy_of", "reduce_cells", "spread", "with_walls"]
+__all__ = [
+    "blocks_of_known",
+    "known_window",
+    "levelled",
+    "occupancy_of",
+    "reduce_cells",
+    "seen_free",
+    "with_walls",
+]
 
 # As sure as a mapper is of a cell that it saw often.
 _FREE_PERCENT, _WALL_PERCENT = 5, 95
@@ -70,10 +78,10 @@ def reduce_cells(values: NDArray[np.int8], size: int, factor: int) -> CellArray:
     """Cells of three values, `factor` blocks of ``size`` x ``size`` a side.
 
     A cell is a wall if half of a line through it is, else free if a third of it is, else unknown;
-    see `drop_specks` for the rest. For all of the factors 1, 2 and 3 they begin at the map's first
+    see `drop_specks` for the rest. For both of the factors 1 and 3 they begin at the map's first
     cell and reach equally far.
     """
-    rows, cols = (-(-length // (6 * size)) * (6 // factor) for length in values.shape)
+    rows, cols = (-(-length // (3 * size)) * (3 // factor) for length in values.shape)
     cells = _blocks(values, factor * size, rows, cols, _FREE_MAX_PERCENT, _WALL_MIN_PERCENT)
     return drop_specks(cells)
 
@@ -95,20 +103,30 @@ def drop_specks(cells: CellArray) -> CellArray:
     return kept
 
 
+def blocks_of_known(cells: CellArray) -> NDArray[np.bool_]:
+    """Which blocks of 2 x 2 cells (R, C), R and C even, are known, by most of them and around."""
+    rows, cols = cells.shape
+    count = (cells != CELL_UNKNOWN).reshape(rows // 2, 2, cols // 2, 2).sum(axis=(1, 3))
+    return cv2.medianBlur((count >= 2).astype(np.uint8), 3) > 0
+
+
+def seen_free(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Free cells (R, C) without strips narrower than three cells.
+
+    Where what is free is told in large blocks, these are the far sides of walls.
+    """
+    wide = cv2.morphologyEx(free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    # The corners of staircases come back.
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return (cv2.dilate(wide, cross) > 0) & free
+
+
 def known_window(cells: CellArray) -> tuple[slice, slice]:
     """Rows and columns around everything known; empty where nothing is."""
     rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
     if len(rows) == 0:
         return slice(0, 0), slice(0, 0)
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
-
-
-def spread(
-    coarse: CellArray, coarse_factor: int, shape: tuple[int, int], factor: int
-) -> CellArray:
-    """For each cell of a finer grid of the same area, the coarse cell under its middle."""
-    rows, cols = (((2 * np.arange(n) + 1) * factor) // (2 * coarse_factor) for n in shape)
-    return coarse.take(rows, axis=0).take(cols, axis=1)
 
 
 def with_walls(known: CellArray, walls: NDArray[np.bool_]) -> CellArray:

@@ -1,4 +1,4 @@
-"""A submap in layers, each of which says more: outline, cells of 0.3 m, walls of 0.2 m, of 0.1 m.
+"""A submap in layers, each of which says more: outline, cells of 0.3 m, walls of 0.1 m.
 
 Every layer decodes with those before it, and with nothing else. The receiver's submap is an
 ordinary one whose cells are those of the finest layer that it has, so that whoever has the same
@@ -7,6 +7,7 @@ layers has the same submap, the sender too.
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 from dataclasses import dataclass
 
@@ -15,20 +16,20 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.link.coding.cell_coder import (
+    CELL_FREE,
     CELL_WALL,
     CellArray,
-    decode_cells,
-    decode_walls,
-    encode_cells,
-    encode_walls,
-    near_walls,
+    decode_marks,
+    encode_marks,
+    near_cells,
 )
 from uw_dslam_ros2.core.link.coding.cells import (
+    blocks_of_known,
     known_window,
     levelled,
     occupancy_of,
     reduce_cells,
-    spread,
+    seen_free,
     with_walls,
 )
 from uw_dslam_ros2.core.link.coding.fields import ByteReader, ByteWriter, digest_of
@@ -46,7 +47,7 @@ __all__ = [
     "write_outline",
 ]
 
-CODEC_VERSION = 2
+CODEC_VERSION = 3
 """Of layers; others are refused."""
 _UNIT_M = 1e-4  # of cell sizes
 _CORNER_M = 1e-3
@@ -54,8 +55,11 @@ _MAX_SIDE = 2000
 _MAX_CORNER = 1_000_000_000  # [mm]
 _TAG_BYTES = 4
 _SMALL_UNITS = 1000  # 0.1 m
-# Cells of 0.3, 0.2 and 0.1 m; of larger cells than 0.1 m the same multiples.
-_FACTORS = {1: 3, 2: 2, 3: 1}
+# Cells of 0.3 and 0.1 m; of larger cells than 0.1 m the same multiples.
+_FACTORS = {1: 3, 2: 1}
+_BLOCK = 2
+"""Cells of 0.3 m a side of the blocks in which free water is told: its border costs most and tells
+the registration least."""
 
 
 class Layer(enum.IntEnum):
@@ -63,11 +67,16 @@ class Layer(enum.IntEnum):
 
     OUTLINE = 0
     COARSE = 1
-    """Cells of 0.3 m, and the path."""
-    MEDIUM = 2
-    """Where the walls are in cells of 0.2 m; what is free is told no better than before."""
-    FINE = 3
-    """The same in cells of 0.1 m."""
+    """Walls in cells of 0.3 m, what is free in blocks of 0.6 m, and the path."""
+    FINE = 2
+    """Where the walls are in cells of 0.1 m; what is free is told no better than before."""
+
+    @classmethod
+    def numbered(cls, number: int) -> Layer:
+        """The layer of a number; `InvalidInputError` where there is none."""
+        if number not in list(cls):
+            raise InvalidInputError(f"number of the layer is {number}, expected 0 to {max(cls)}")
+        return cls(number)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,10 +135,10 @@ class LayeredSubmap:
             if self.cells is None or self.cells.tag != found.tag:
                 self.cells = found
             return layer
-        if self.cells is None or self.cells.layer != layer - 1:
+        if self.cells is None or self.cells.layer is not Layer.COARSE:
             held = "none" if self.cells is None else self.cells.layer.name
-            raise InvalidInputError(f"layer {layer.name} builds on {held}")
-        self.cells = _read_finer(reader, self.cells, layer, self._key)
+            raise InvalidInputError(f"layer {layer.name} builds on {held}, expected COARSE")
+        self.cells = _read_fine(reader, self.cells, self._key)
         return layer
 
     @property
@@ -165,7 +174,7 @@ class LayeredSubmap:
 
 
 def encode_submap(
-    submap: Submap, key: bytes = b"", finest: Layer = Layer.MEDIUM
+    submap: Submap, key: bytes = b"", finest: Layer = Layer.FINE
 ) -> dict[Layer, bytes]:
     """Layers of a submap, down to `finest`.
 
@@ -187,11 +196,8 @@ def encode_submap(
     corner = (corner[0] + col * unit // 10, corner[1] + row * unit // 10)
     coarse_data, coarse = _write_coarse(submap, unit, corner, reduced[Layer.COARSE], key)
     layers = {Layer.COARSE: coarse_data}
-    below = coarse
-    for layer in (Layer.MEDIUM, Layer.FINE):
-        if layer > finest:
-            break
-        layers[layer], below = _write_finer(below, layer, reduced[layer], key)
+    if finest is Layer.FINE:
+        layers[Layer.FINE] = _write_fine(coarse, reduced[Layer.FINE], key)
     reach, histogram, length_m = shape_of_cells(
         coarse.cells, coarse.resolution_m, (corner[0] * _CORNER_M, corner[1] * _CORNER_M)
     )
@@ -244,7 +250,7 @@ def _head(data: bytes) -> tuple[Layer, ByteReader]:
     head = reader.fixed(1)
     if head >> 2 != CODEC_VERSION:
         raise InvalidInputError(f"version of the codec is {head >> 2}, expected {CODEC_VERSION}")
-    return Layer(head & 3), reader
+    return Layer.numbered(head & 3), reader
 
 
 def _reduced(
@@ -252,8 +258,7 @@ def _reduced(
 ) -> tuple[dict[Layer, CellArray], tuple[int, int]]:
     """Cells of each layer down to `finest`, cut to what is known, and its first row and column.
 
-    The window begins and ends on corners that the cells of all layers share; first row and
-    column are counted in cells of the finest layer.
+    The window is whole blocks; first row and column are counted in cells of the finest layer.
     """
     values = np.ascontiguousarray(values)
     cells = {
@@ -262,21 +267,22 @@ def _reduced(
         if number <= finest
     }
     rows, cols = known_window(cells[Layer.COARSE])
-    first = rows.start // 2 * 2, cols.start // 2 * 2
-    last = -(-rows.stop // 2) * 2, -(-cols.stop // 2) * 2
-    last = max(last[0], first[0] + 2), max(last[1], first[1] + 2)
+    sides = [-(-max(1, window.stop - window.start) // _BLOCK) * _BLOCK for window in (rows, cols)]
     cut = {}
     for layer, whole in cells.items():
+        times = _FACTORS[Layer.COARSE] // _FACTORS[layer]
         row_0, row_1, col_0, col_1 = (
-            3 * edge // _FACTORS[layer] for edge in (first[0], last[0], first[1], last[1])
+            times * edge for edge in (rows.start, rows.stop, cols.start, cols.stop)
         )
-        cut[layer] = np.ascontiguousarray(whole[row_0:row_1, col_0:col_1])
+        part = whole[row_0:row_1, col_0:col_1]
+        cut[layer] = np.zeros((times * sides[0], times * sides[1]), np.int8)
+        cut[layer][: part.shape[0], : part.shape[1]] = part
     fine = tuple(_FACTORS[Layer.COARSE] * side for side in cut[Layer.COARSE].shape)
     if max(fine) > _MAX_SIDE:
         raise InvalidInputError(
             f"the submap is {fine} cells of the finest layer, expected at most {_MAX_SIDE} a side"
         )
-    return cut, (3 * first[0], 3 * first[1])
+    return cut, (3 * rows.start, 3 * cols.start)
 
 
 def _write_coarse(
@@ -286,15 +292,34 @@ def _write_coarse(
     body.varint(unit)
     body.signed(corner[0])
     body.signed(corner[1])
-    body.varint(cells.shape[0] // 2)
-    body.varint(cells.shape[1] // 2)
+    body.varint(cells.shape[0] // _BLOCK)
+    body.varint(cells.shape[1] // _BLOCK)
     write_path(body, submap.trajectory_stamp_ns, submap.trajectory)
     head = bytes(body)
     path = read_path(_read_shape(head)[1])
-    found = _tagged(head, unit, corner, cells, path, key)
+    is_known = blocks_of_known(cells)
+    free = _free_cells(is_known)
+    is_open = near_cells(free > 0)
+    walls = (cells == CELL_WALL) & is_open
+    found = _tagged(head, unit, corner, _with_marked(free, walls), path, key)
+    blocks = encode_marks(is_known, np.zeros(is_known.shape, np.int8))
     writer = _begun(Layer.COARSE)
-    writer.raw(found.tag + head + encode_cells(cells, np.zeros_like(cells)))
+    writer.raw(found.tag + head)
+    writer.varint(len(blocks))
+    writer.raw(blocks + encode_marks(walls, free, is_open))
     return bytes(writer), found
+
+
+def _free_cells(is_known: NDArray[np.bool_]) -> CellArray:
+    """Free where a block is known, unknown elsewhere."""
+    cells = is_known.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)
+    return np.where(cells, np.int8(CELL_FREE), np.int8(0))
+
+
+def _with_marked(free: CellArray, walls: NDArray[np.bool_]) -> CellArray:
+    cells = seen_free((free > 0) & ~walls).astype(np.int8) * np.int8(CELL_FREE)
+    cells[walls] = CELL_WALL
+    return cells
 
 
 def _read_coarse(reader: ByteReader, key: bytes) -> CellLayer:
@@ -314,8 +339,11 @@ def _decoded_coarse(body: bytes, key: bytes) -> CellLayer:
     (unit, corner, shape), reader = _read_shape(body)
     path = read_path(reader)
     head = body[: len(body) - len(reader.rest)]
-    cells = decode_cells(reader.rest, np.zeros(shape, np.int8))
-    return _tagged(head, unit, corner, cells, path, key)
+    blocks = reader.raw(reader.varint())
+    unknown = np.zeros((shape[0] // _BLOCK, shape[1] // _BLOCK), np.int8)
+    free = _free_cells(decode_marks(blocks, unknown))
+    walls = decode_marks(reader.rest, free, near_cells(free > 0))
+    return _tagged(head, unit, corner, _with_marked(free, walls), path, key)
 
 
 def _read_shape(body: bytes) -> tuple[tuple[int, tuple[int, int], tuple[int, int]], ByteReader]:
@@ -324,8 +352,8 @@ def _read_shape(body: bytes) -> tuple[tuple[int, tuple[int, int], tuple[int, int
     unit = reader.bounded("the size of cells [0.1 mm]", 1, 1_000_000)
     corner = reader.signed(), reader.signed()
     shape = (
-        2 * reader.bounded("half the number of rows", 1, _MAX_SIDE // 6),
-        2 * reader.bounded("half the number of columns", 1, _MAX_SIDE // 6),
+        _BLOCK * reader.bounded("the number of rows of blocks", 1, _MAX_SIDE // 6),
+        _BLOCK * reader.bounded("the number of columns of blocks", 1, _MAX_SIDE // 6),
     )
     if max(abs(value) for value in corner) > _MAX_CORNER:
         raise InvalidInputError(f"the corner is {corner} mm, expected within {_MAX_CORNER}")
@@ -344,38 +372,29 @@ def _tagged(
     return CellLayer(Layer.COARSE, unit, corner, cells, *path, tag, tag)
 
 
-def _write_finer(
-    below: CellLayer, layer: Layer, cells: CellArray, key: bytes
-) -> tuple[bytes, CellLayer]:
-    known = spread(below.cells, _FACTORS[below.layer], cells.shape, _FACTORS[layer])
-    walls = (cells == CELL_WALL) & near_walls(known)
-    found = _refined(below, layer, with_walls(known, walls), key)
-    writer = _begun(layer)
-    writer.raw(found.tag + encode_walls(walls, known))
-    return bytes(writer), found
+def _write_fine(below: CellLayer, cells: CellArray, key: bytes) -> bytes:
+    known = _known_of_fine(below)
+    is_open = near_cells(known == CELL_WALL)
+    walls = (cells == CELL_WALL) & is_open
+    found = _refined(below, with_walls(known, walls), key)
+    writer = _begun(Layer.FINE)
+    writer.raw(found.tag + encode_marks(walls, known, is_open))
+    return bytes(writer)
 
 
-def _read_finer(reader: ByteReader, below: CellLayer, layer: Layer, key: bytes) -> CellLayer:
+def _read_fine(reader: ByteReader, below: CellLayer, key: bytes) -> CellLayer:
     tag = reader.raw(_TAG_BYTES)
-    return _checked(_decoded_finer(reader.rest, below, layer, key), tag)
+    known = _known_of_fine(below)
+    walls = decode_marks(reader.rest, known, near_cells(known == CELL_WALL))
+    return _checked(_refined(below, with_walls(known, walls), key), tag)
 
 
-def _decoded_finer(data: bytes, below: CellLayer, layer: Layer, key: bytes) -> CellLayer:
-    old, new = _FACTORS[below.layer], _FACTORS[layer]
-    shape = below.cells.shape[0] * old // new, below.cells.shape[1] * old // new
-    known = spread(below.cells, old, shape, new)
-    return _refined(below, layer, with_walls(known, decode_walls(data, known)), key)
+def _known_of_fine(below: CellLayer) -> CellArray:
+    """What the coarse layer says of each cell of the fine one."""
+    factor = _FACTORS[Layer.COARSE] // _FACTORS[Layer.FINE]
+    return np.ascontiguousarray(below.cells.repeat(factor, axis=0).repeat(factor, axis=1))
 
 
-def _refined(below: CellLayer, layer: Layer, cells: CellArray, key: bytes) -> CellLayer:
+def _refined(below: CellLayer, cells: CellArray, key: bytes) -> CellLayer:
     tag = digest_of(below.tag + cells.tobytes(), key)
-    return CellLayer(
-        layer,
-        below.unit,
-        below.corner,
-        cells,
-        below.stamps_ns,
-        below.trajectory,
-        tag,
-        below.first_tag,
-    )
+    return dataclasses.replace(below, layer=Layer.FINE, cells=cells, tag=tag)

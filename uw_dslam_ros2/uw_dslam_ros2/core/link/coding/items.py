@@ -10,7 +10,6 @@ from uw_dslam_ros2.core.link.coding.codec import Layer
 from uw_dslam_ros2.core.link.coding.fields import ByteReader, ByteWriter
 
 __all__ = [
-    "Ask",
     "ItemKind",
     "LayerKey",
     "PeerReport",
@@ -36,8 +35,7 @@ class ItemKind(enum.IntEnum):
     LAYER = 2
     ANSWER = 3
     STATUS = 4
-    ASK = 5
-    WHOLE = 6
+    WHOLE = 5
     """Of a note: an item that needs no cutting."""
 
 
@@ -63,7 +61,7 @@ class LayerKey:
     def read(cls, reader: ByteReader) -> LayerKey:
         """Take one."""
         run, value = reader.fixed(_RUN_BYTES), reader.varint()
-        return cls(run, value // 4, Layer(value % 4))
+        return cls(run, value // 4, Layer.numbered(value % 4))
 
 
 def hello_item(name: str) -> bytes:
@@ -166,34 +164,16 @@ class Status:
         return cls(num_items, voids, peers, bool(head & 1))
 
 
-@dataclass(frozen=True, slots=True)
-class Ask:
-    """Somebody wants a layer of a vehicle's submap."""
-
-    sender: int  # whose submap it is
-    key: LayerKey
-
-    def pack(self) -> bytes:
-        """To a note."""
-        writer = ByteWriter()
-        writer.fixed(ItemKind.ASK, 1)
-        writer.fixed(self.sender, 1)
-        self.key.write(writer)
-        return bytes(writer)
-
-
 def whole_note(framed_item: bytes) -> bytes:
     """A framed item as a note."""
     return bytes([ItemKind.WHOLE]) + framed_item
 
 
-def read_note(note: bytes) -> Status | Ask | bytes:
+def read_note(note: bytes) -> Status | bytes:
     """A note of a bundle; bytes are a framed item."""
     kind, reader = read_item(note)
     if kind is ItemKind.STATUS:
         return Status.read(reader)
-    if kind is ItemKind.ASK:
-        return Ask(reader.fixed(1), LayerKey.read(reader))
     if kind is ItemKind.WHOLE:
         return reader.rest
-    raise InvalidInputError(f"a note of kind {kind.name}, expected STATUS or ASK")
+    raise InvalidInputError(f"a note of kind {kind.name}, expected STATUS or WHOLE")
