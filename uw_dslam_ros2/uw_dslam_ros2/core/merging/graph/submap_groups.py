@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
@@ -147,11 +148,32 @@ def shared_area_m2(source: StoredSubmap, target: StoredSubmap, T_target_source: 
     if math.hypot(T_target_source.x, T_target_source.y) > reach:
         return 0.0
     grid = target.submap.grid
-    cells = grid.spec.cells_of(T_target_source.apply(source.footprint))
-    cells = cells[grid.spec.contains(cells)]
-    return float(np.count_nonzero(grid.values[cells[:, 0], cells[:, 1]] >= 0)) * (
-        source.area_per_point_m2
-    )
+    num = _num_known(
+        source.footprint, _turn_and_shift(T_target_source),
+        _turn_and_shift(grid.spec.T_frame_grid.inverse()), grid.spec.resolution_m, grid.values,
+    )  # fmt: skip
+    return num * source.area_per_point_m2
+
+
+def _turn_and_shift(motion: SE2) -> tuple[float, float, float, float]:
+    return math.cos(motion.yaw), math.sin(motion.yaw), motion.x, motion.y
+
+
+@njit(cache=True, nogil=True)
+def _num_known(points, T_target_source, T_grid_target, resolution_m, values):  # type: ignore[no-untyped-def]
+    """How many points (K, 2) [m] lie on known cells; motions are (cos, sin, x, y)."""
+    cos, sin, x_0, y_0 = T_target_source
+    grid_cos, grid_sin, grid_x, grid_y = T_grid_target
+    num_rows, num_cols = values.shape
+    count = 0
+    for k in range(points.shape[0]):
+        x = cos * points[k, 0] - sin * points[k, 1] + x_0
+        y = sin * points[k, 0] + cos * points[k, 1] + y_0
+        col = math.floor((grid_cos * x - grid_sin * y + grid_x) / resolution_m)
+        row = math.floor((grid_sin * x + grid_cos * y + grid_y) / resolution_m)
+        if 0 <= row < num_rows and 0 <= col < num_cols and values[row, col] >= 0:
+            count += 1
+    return count
 
 
 def _thinned(known: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float]:
