@@ -21,7 +21,7 @@ def random_map(rng, rows=90, cols=120, pose=SE2()):
 @pytest.mark.parametrize("zoom", [2, 3, 4])  # down to a pixel a cell
 def test_pixels_show_the_cell_under_them(rng, zoom):
     occupancy = random_map(rng, pose=SE2(1.3, -2.1, 0.4))
-    layer = Layer(occupancy, SE2(5.0, 7.0, -1.0))
+    layer = Layer.of(occupancy, SE2(5.0, 7.0, -1.0))
     colours = colours_of_percent()
     pixel_m = 2.0**-zoom
     num_shown = 0
@@ -48,7 +48,7 @@ def test_pixels_show_the_cell_under_them(rng, zoom):
 def test_walls_outlast_a_coarse_zoom():
     values = np.zeros((1000, 1000), np.int8)
     values[500] = 100
-    layer = Layer(OccupancyMap(GridSpec(0.05, 1000, 1000), values))
+    layer = Layer.of(OccupancyMap(GridSpec(0.05, 1000, 1000), values))
     picture = decoded(tile_png([layer], 0, 0, -1))
     is_dark = (picture[:, :, 0] < 100) & (picture[:, :, 3] > 0)
     assert is_dark[:, 10:40].any(axis=0).all()  # a quay of one cell is seen at a pixel a metre
@@ -56,5 +56,5 @@ def test_walls_outlast_a_coarse_zoom():
 
 def test_nothing_known_is_no_tile():
     unknown = OccupancyMap(GridSpec(0.1, 10, 10), np.full((10, 10), -1, np.int8))
-    assert tile_png([Layer(unknown)], 3, 0, -1) is None
+    assert tile_png([Layer.of(unknown)], 3, 0, -1) is None
     assert tile_png([], 3, 0, 0) is None

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.grid import UNKNOWN, UNSEEN, GridSpec, OccupancyMap, percent_table
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["Drawable", "Mosaic", "Window", "fuse_maps"]
+__all__ = ["SQUARE", "Drawable", "Mosaic", "Window", "fuse_maps"]
 
-_TILE = 256
+SQUARE = 256
+"""Cells are kept in squares of so many rows and columns."""
 _UNSEEN = int(UNSEEN)
 
 
@@ -177,6 +178,17 @@ class Mosaic:
             _to_percent(tile.total, tile.num_occupied, tile.num_free, table, *place, values)
         return OccupancyMap(self.spec_of(window), values)
 
+    def squares(self) -> list[tuple[int, int]]:
+        """Row and column, in squares, of those in which something was observed."""
+        return list(self._tiles)
+
+    def square(self, row: int, col: int, log_odds_max: float) -> NDArray[np.int8]:
+        """Percent (SQUARE, SQUARE) of the cells of one of `squares`, as in `occupancy`."""
+        tile, values = self._tiles[row, col], np.full((SQUARE, SQUARE), UNKNOWN, np.int8)
+        table = percent_table(log_odds_max)
+        _to_percent(tile.total, tile.num_occupied, tile.num_free, table, 0, 0, values)
+        return values
+
     def contradictions(self) -> NDArray[np.uint16] | None:
         """For each cell of `occupancy`, how many grids vote against its majority."""
         window = self.window()
@@ -226,11 +238,11 @@ class Mosaic:
         """Add a grid to the tiles, or subtract it; returns the rectangle that it has seen."""
         drawing = _Drawing(self._lattice, grid, T_frame_map)
         reach, seen = drawing.window, []
-        for row in range(reach.row_0 // _TILE, (reach.row_1 - 1) // _TILE + 1):
-            for col in range(reach.col_0 // _TILE, (reach.col_1 - 1) // _TILE + 1):
-                corner = row * _TILE, col * _TILE
+        for row in range(reach.row_0 // SQUARE, (reach.row_1 - 1) // SQUARE + 1):
+            for col in range(reach.col_0 // SQUARE, (reach.col_1 - 1) // SQUARE + 1):
+                corner = row * SQUARE, col * SQUARE
                 tile = self._tiles.get((row, col)) or _Layers(
-                    Window(*corner, corner[0] + _TILE, corner[1] + _TILE)
+                    Window(*corner, corner[0] + SQUARE, corner[1] + SQUARE)
                 )
                 window = drawing.add_to(tile, sign)
                 if window is not None:

@@ -29,6 +29,7 @@ __all__ = [
     "outline_of",
     "registration_row",
     "submap_row",
+    "track_piece",
     "vehicle_rows",
 ]
 
@@ -43,6 +44,14 @@ class Names(RunNames):
 
     def __init__(self, records: Sequence[SubmapRecord]) -> None:
         super().__init__(record.submap for record in records)
+        self._of_submaps: dict[SubmapId, str] = {}
+
+    def submap(self, submap_id: SubmapId) -> str:
+        """As of all runs; a page names each submap many times."""
+        name = self._of_submaps.get(submap_id)
+        if name is None:
+            name = self._of_submaps[submap_id] = super().submap(submap_id)
+        return name
 
 
 def outline_of(occupancy: OccupancyMap) -> FloatArray:
@@ -62,7 +71,7 @@ def outline_of(occupancy: OccupancyMap) -> FloatArray:
 
 
 def vehicle_rows(
-    records: Sequence[SubmapRecord], T_view_group: Mapping[int, SE2], names: Names
+    records: Sequence[SubmapRecord], pieces: Mapping[SubmapId, list[list[float]]], names: Names
 ) -> list[dict[str, Any]]:
     """Each run of each vehicle with its track, one piece for each submap, oldest first."""
     rows: dict[str, dict[str, Any]] = {}
@@ -88,15 +97,18 @@ def vehicle_rows(
         if not is_merged or not row["reason"]:
             row["reason"] = record.reason
         row["newest_s"] = max(row.get("newest_s", 0.0), submap.stamp_ns * 1e-9)
-        if record.state is not SubmapState.WITHDRAWN and len(submap.trajectory):
-            motion = T_view_group[record.component] @ record.T_component_submap
-            row["track"].append(
-                {
-                    "submap": names.submap(submap.submap_id),
-                    "xy": _thinned(motion.apply(submap.trajectory[:, :2])),
-                }
-            )
+        if piece := pieces.get(submap.submap_id):
+            row["track"].append({"submap": names.submap(submap.submap_id), "xy": piece})
     return [rows[name] for name in sorted(rows)]
+
+
+def track_piece(record: SubmapRecord, T_view_group: SE2) -> list[list[float]]:
+    """Way of a vehicle while a submap was made; empty where that is not known, or withdrawn."""
+    submap = record.submap
+    if record.state is SubmapState.WITHDRAWN or not len(submap.trajectory):
+        return []
+    motion = T_view_group @ record.T_component_submap
+    return _thinned(motion.apply(submap.trajectory[:, :2]))
 
 
 def submap_row(

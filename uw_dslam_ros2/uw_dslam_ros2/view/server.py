@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import gzip
 import hmac
 import ipaddress
 import json
 import secrets
+import time
 from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
@@ -21,9 +23,9 @@ from uw_dslam_ros2.core.merging import Decision
 from uw_dslam_ros2.io.decisions import decision_from_plain
 from uw_dslam_ros2.view.export import export_zip
 from uw_dslam_ros2.view.laying import lay_out, run_map
+from uw_dslam_ros2.view.pace import Pace
 from uw_dslam_ros2.view.pairs import PAIR_LAYERS, Pair
 from uw_dslam_ros2.view.showing import Register, Showing
-from uw_dslam_ros2.view.tiles import tile_png
 
 __all__ = ["Source", "ViewServer", "is_loopback"]
 
@@ -39,6 +41,8 @@ _HEADERS = {
 _MAX_ZOOM, _MIN_ZOOM = 10, -8
 _MAX_PAIRS = 8
 _MAX_BODY_BYTES = 10_000
+_SHARE = 0.25
+"""Of a core, that pages which follow changes may cost: they are told of them less often."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -109,6 +113,8 @@ class ViewServer:
         self._runner: web.AppRunner | None = None
         self._pairs: dict[tuple[str, int, int | None], Pair] = {}
         self._is_closing = False
+        self._telling: asyncio.Task[None] | None = None
+        self._pace, self._loop_s = Pace(_SHARE), 0.0
 
     async def start(self) -> str:
         """Listen; returns the page's address for a browser."""
@@ -148,14 +154,27 @@ class ViewServer:
         return f"http://{host}:{port}{query}"
 
     async def notify(self) -> None:
-        """Tell all pages that something has changed."""
+        """Tell all pages that something has changed, as often as what they then ask allows."""
+        if self._telling is None and not self._is_closing:
+            self._telling = asyncio.create_task(self._tell())
+
+    async def _tell(self) -> None:
+        # This thread serves nothing but pages.
+        self._pace.spend(time.thread_time() - self._loop_s)
+        await asyncio.sleep(self._pace.wait_s(time.monotonic()))
+        self._pace.begin(time.monotonic())
+        self._loop_s = time.thread_time()
+        self._telling = None
         async with self._changed:
             self._changed.notify_all()
 
     async def stop(self) -> None:
         """Close."""
         self._is_closing = True
-        await self.notify()
+        if self._telling is not None:
+            self._telling.cancel()
+        async with self._changed:
+            self._changed.notify_all()
         if self._runner is not None:
             await self._runner.cleanup()
         self._pool.shutdown(wait=False, cancel_futures=True)
@@ -218,7 +237,8 @@ class ViewServer:
         def work() -> tuple[str, bytes]:
             showing = self._source.showing()
             scene = {"title": self._source.title, **showing.scene()}
-            return showing.version, json.dumps(scene, allow_nan=False).encode()
+            # A quick compression: the page is near, and all of this changes often.
+            return showing.version, gzip.compress(json.dumps(scene, allow_nan=False).encode(), 1)
 
         version, body = await self._in_thread(work)
         tag = f'"{version}"'
@@ -227,9 +247,8 @@ class ViewServer:
         response = web.Response(
             body=body,
             content_type="application/json",
-            headers={"ETag": tag, "Cache-Control": "no-cache"},
+            headers={"ETag": tag, "Cache-Control": "no-cache", "Content-Encoding": "gzip"},
         )
-        response.enable_compression()
         return response
 
     async def _status(self, _request: web.Request) -> web.StreamResponse:
@@ -294,7 +313,7 @@ class ViewServer:
         moment = None if info["moment"] == "all" else int(info["moment"])
 
         def work() -> bytes | None:
-            return tile_png(self._source.showing().layers(moment), zoom, col, row)
+            return self._source.showing().tile(moment, zoom, col, row)
 
         body = await self._in_thread(work)
         # The address names the version, so what it holds never changes.
@@ -350,7 +369,15 @@ class ViewServer:
 
     async def _in_thread(self, work: Callable[[], Any]) -> Any:
         """One at a time, beside the loop, which goes on answering."""
-        return await asyncio.get_running_loop().run_in_executor(self._pool, work)
+
+        def timed() -> Any:
+            begun_s = time.thread_time()
+            try:
+                return work()
+            finally:
+                self._pace.spend(time.thread_time() - begun_s)
+
+        return await asyncio.get_running_loop().run_in_executor(self._pool, timed)
 
 
 def _call_in(

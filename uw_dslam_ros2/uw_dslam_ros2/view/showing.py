@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,12 +20,12 @@ from uw_dslam_ros2.core.merging import (
     SubmapState,
 )
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
-from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
 from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapGroup, render_group
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.view.drawn import Drawn
 from uw_dslam_ros2.view.overview import (
     Names,
     constraint_row,
@@ -33,10 +33,10 @@ from uw_dslam_ros2.view.overview import (
     outline_of,
     registration_row,
     submap_row,
+    track_piece,
     vehicle_rows,
 )
 from uw_dslam_ros2.view.pairs import Pair, lay_on
-from uw_dslam_ros2.view.tiles import Layer, bounds_of
 
 __all__ = ["Register", "Showing"]
 
@@ -46,7 +46,16 @@ Register = Callable[[OccupancyMap, OccupancyMap, Any], RegistrationResult]
 """Source, target, prior or None: asks for one registration; used for rivals."""
 
 _GAP_SHARE = 0.08  # of the page's width, between groups that stand side by side
-_MAX_LAYERS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SubmapShown:
+    """What was made of a submap, and of what."""
+
+    submap: Submap
+    key: tuple[Hashable, ...]
+    row: dict[str, Any]
+    track: list[list[float]]
 
 
 class Showing:
@@ -82,8 +91,9 @@ class Showing:
         self._answers = list(answers)
         self._stored: dict[SubmapId, StoredSubmap] = dict(before._stored) if before else {}
         self._outlines: dict[SubmapId, FloatArray] = dict(before._outlines) if before else {}
-        self._drawn: dict[int, GlobalMap] = before._drawn if before else {}
-        self._layers: OrderedDict[int, list[Layer]] = OrderedDict()
+        # The newest, and another moment: who goes back in time must not cost the others.
+        self._drawn: Drawn = before._drawn if before else Drawn()
+        self._past: Drawn = before._past if before else Drawn()
         for record in self.records:
             submap, key = record.submap, record.submap.submap_id
             held = self._stored.get(key)
@@ -94,6 +104,8 @@ class Showing:
             (r for r in self.records if r.state is not SubmapState.WITHDRAWN),
             key=lambda r: (r.submap.stamp_ns, r.submap.submap_id),
         )
+        self._rows: dict[SubmapId, _SubmapShown] = before._rows if before else {}
+        self._boxes = self._boxes_of_groups()
         self._T_view_group = self._side_by_side()
         self.version = self._fingerprint()
 
@@ -125,6 +137,7 @@ class Showing:
             for r in self.records
             if r.state is not SubmapState.WITHDRAWN
         }
+        rows = {record.submap.submap_id: self._submap_shown(record) for record in self.records}
         constraints = (constraint_row(c, places, self.names) for c in self.constraints)
         return {
             "version": self.version,
@@ -136,16 +149,10 @@ class Showing:
                 for r in self._by_time
             ],
             "groups": self._group_rows(),
-            "vehicles": vehicle_rows(self.records, self._T_view_group, self.names),
-            "submaps": [
-                submap_row(
-                    r,
-                    self._outlines[r.submap.submap_id],
-                    self._T_view_group[r.component],
-                    self.names,
-                )
-                for r in self.records
-            ],
+            "vehicles": vehicle_rows(
+                self.records, {i: shown.track for i, shown in rows.items()}, self.names
+            ),
+            "submaps": [shown.row for shown in rows.values()],
             "constraints": [row for row in constraints if row is not None],
             "decisions": [decision_row(record, places, self.names) for record in self.decisions],
             "earth": self.georeference
@@ -159,22 +166,13 @@ class Showing:
             ],
         }
 
-    def layers(self, moment: int | None = None) -> list[Layer]:
-        """Maps of all groups, made of the first `moment` submaps (None: all)."""
-        count = self.num_moments if moment is None else max(0, min(moment, self.num_moments))
-        if count not in self._layers:
-            self._layers[count] = [
-                Layer(occupancy, self._T_view_group[group])
-                for group, occupancy in self._maps(count)
-            ]
-            while len(self._layers) > _MAX_LAYERS:
-                self._layers.popitem(last=False)
-        self._layers.move_to_end(count)
-        return self._layers[count]
+    def tile(self, moment: int | None, zoom: int, col: int, row: int) -> bytes | None:
+        """Picture of the first `moment` submaps (None: all), as `tile_png`."""
+        return self._shown(moment).tile(zoom, col, row)
 
     def map_of(self, group: int) -> OccupancyMap | None:
         """One group's map in its own frame; None where nothing was seen."""
-        return dict(self._maps(self.num_moments)).get(group)
+        return self._shown(None).map_of(group)
 
     def cell(self, x_m: float, y_m: float) -> dict[str, Any] | None:
         """What is known of the cell under a place of the page; None where nothing is."""
@@ -259,30 +257,30 @@ class Showing:
             raise InvalidInputError("the map of this pair is empty")
         return occupancy
 
-    def _maps(self, count: int) -> list[tuple[int, OccupancyMap]]:
-        shown: dict[int, dict[SubmapId, SE2]] = {group: {} for group in self._T_view_group}
-        for record in self._by_time[:count]:
-            shown[record.component][record.submap.submap_id] = record.T_component_submap
-        maps = []
-        for group, poses in sorted(shown.items()):
-            drawn = self._drawn.get(group)
-            if drawn is None:
-                spec = self._first(group).submap.grid.spec
-                drawn = GlobalMap(pinned_lattice(spec, spec.resolution_m), LOG_ODDS_MAX)
-                self._drawn[group] = drawn
-            drawn.draw(self._stored, poses)
-            occupancy = drawn.occupancy()
-            if occupancy is not None:
-                maps.append((group, occupancy))
-        return maps
+    def _submap_shown(self, record: SubmapRecord) -> _SubmapShown:
+        """What the page has of a submap, as before where nothing changed: most of its bytes."""
+        submap_id, group = record.submap.submap_id, self._T_view_group[record.component]
+        name = self.names.submap(submap_id)
+        key = name, record.state, record.component, record.T_component_submap, record.reason, group
+        held = self._rows.get(submap_id)
+        if held is None or held.submap is not record.submap or held.key != key:
+            row = submap_row(record, self._outlines[submap_id], group, self.names)
+            held = _SubmapShown(record.submap, key, row, track_piece(record, group))
+            self._rows[submap_id] = held
+        return held
 
-    def _first(self, group: int) -> SubmapRecord:
-        return next(r for r in self._by_time if r.component == group)
+    def _shown(self, moment: int | None) -> Drawn:
+        count = self.num_moments if moment is None else max(0, min(moment, self.num_moments))
+        drawn = self._drawn if count == self.num_moments else self._past
+        groups: dict[int, dict[SubmapId, SE2]] = {group: {} for group in self._T_view_group}
+        for record in self._by_time[:count]:
+            groups[record.component][record.submap.submap_id] = record.T_component_submap
+        drawn.show((self.version, count), self._stored, groups, self._T_view_group)
+        return drawn
 
     def _side_by_side(self) -> dict[int, SE2]:
         """Where each group's frame lies on the page: the first as it is, the others beside it."""
-        groups = sorted({record.component for record in self._by_time})
-        boxes = {group: self._box(group) for group in groups}
+        boxes = self._boxes
         gap = _GAP_SHARE * sum(high_x - low_x for low_x, _, high_x, _ in boxes.values())
         placed: dict[int, SE2] = {}
         edge_m = top_m = 0.0
@@ -296,22 +294,24 @@ class Showing:
             placed.setdefault(record.component, SE2())
         return placed
 
-    def _box(self, group: int) -> tuple[float, float, float, float]:
-        boxes = np.array(
-            [
-                bounds_of(r.submap.grid.spec, r.T_component_submap)
-                for r in self._by_time
-                if r.component == group
-            ]
-        )
-        low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
-        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+    def _boxes_of_groups(self) -> dict[int, tuple[float, float, float, float]]:
+        """Rectangle around each group in its own frame, ``x_min, y_min, x_max, y_max``."""
+        corners: dict[int, list[FloatArray]] = {}
+        for r in self._by_time:
+            spec = r.submap.grid.spec
+            corners.setdefault(r.component, []).append(r.T_component_submap.apply(spec.corners()))
+        boxes = {}
+        for group in sorted(corners):
+            points = np.concatenate(corners[group])
+            (low_x, low_y), (high_x, high_y) = points.min(axis=0), points.max(axis=0)
+            boxes[group] = float(low_x), float(low_y), float(high_x), float(high_y)
+        return boxes
 
     def _group_rows(self) -> list[dict[str, Any]]:
         rows = []
         for group in sorted({record.component for record in self._by_time}):
             own = [r for r in self._by_time if r.component == group]
-            low_x, low_y, high_x, high_y = self._box(group)
+            low_x, low_y, high_x, high_y = self._boxes[group]
             shift = self._T_view_group[group]
             rows.append(
                 {

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.mosaic import SQUARE, Window
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["TILE_PIXELS", "Layer", "colours_of_percent", "png_bytes", "tile_png"]
+__all__ = ["TILE_PIXELS", "Layer", "bounds_of", "colours_of_percent", "png_bytes", "tile_png"]
 
 ByteArray = NDArray[np.uint8]
 
@@ -35,50 +34,123 @@ def colours_of_percent() -> ByteArray:
 _COLOURS = colours_of_percent()
 
 
-@dataclass(frozen=True, eq=False)
 class Layer:
-    """A map and where it is shown.
+    """A map and where it is shown, in squares of cells, which are made when they are looked at.
 
-    ``T_view_map`` takes the map's frame to that of the page, in which groups that are not joined
-    stand side by side.
+    Each level is half as fine as the one before; walls outlast the rest.
+
+    Parameters
+    ----------
+    lattice
+        Where cell (0, 0) lies, and how large cells are; its size does not count.
+    square
+        Percent (SQUARE, SQUARE) of a square of cells by row and column of squares, -1 unknown.
+    T_view_map
+        Takes the map's frame to that of the page, in which groups that are not joined stand side
+        by side.
     """
 
-    occupancy: OccupancyMap
-    T_view_map: SE2 = SE2()
+    def __init__(
+        self,
+        lattice: GridSpec,
+        square: Callable[[int, int], NDArray[np.int8]],
+        T_view_map: SE2 = SE2(),
+    ) -> None:
+        self.lattice, self.T_view_map = lattice, T_view_map
+        self._square = square
+        self._known: list[set[tuple[int, int]]] = [set()]
+        self._made: dict[tuple[int, int, int], ByteArray] = {}
 
-    @cached_property
-    def levels(self) -> list[ByteArray]:
-        """Stored cells, each level half as fine as the one before; walls outlast the rest."""
-        values = self.occupancy.values
-        levels = [(values.astype(np.int16) + 1).astype(np.uint8)]
-        while max(levels[-1].shape) > 1:
-            fine = levels[-1]
-            rows, cols = -(-fine.shape[0] // 2), -(-fine.shape[1] // 2)
-            even = np.zeros((2 * rows, 2 * cols), np.uint8)
-            even[: fine.shape[0], : fine.shape[1]] = fine
-            levels.append(even.reshape(rows, 2, cols, 2).max(axis=(1, 3)))
-        return levels
+    @classmethod
+    def of(cls, occupancy: OccupancyMap, T_view_map: SE2 = SE2()) -> Layer:
+        """A map that does not change."""
+        values = occupancy.values
+        rows, cols = (-(-side // SQUARE) for side in values.shape)
+
+        def square(row: int, col: int) -> NDArray[np.int8]:
+            found = np.full((SQUARE, SQUARE), -1, np.int8)
+            part = values[row * SQUARE :, col * SQUARE :][:SQUARE, :SQUARE]
+            found[: part.shape[0], : part.shape[1]] = part
+            return found
+
+        layer = cls(occupancy.spec, square, T_view_map)
+        layer.change((row, col) for row in range(rows) for col in range(cols))
+        return layer
+
+    def change(self, known: Iterable[tuple[int, int]], window: Window | None = None) -> None:
+        """Say which squares there are, and in which rectangle of cells they changed; None: all."""
+        self._known = [set(known)]
+        if window is None:
+            self._made.clear()
+            return
+        for level, row, col in list(self._made):
+            side = SQUARE << level
+            if (
+                row * side < window.row_1
+                and (row + 1) * side > window.row_0
+                and col * side < window.col_1
+                and (col + 1) * side > window.col_0
+            ):
+                del self._made[level, row, col]
 
     def sampled(
         self, x_m: NDArray[np.float64], y_m: NDArray[np.float64], pixel_m: float
     ) -> ByteArray:
         """Stored cells under places (N,) of the page, at the level that suits a pixel's size."""
-        spec = self.occupancy.spec
+        resolution_m = self.lattice.resolution_m
         # Cells no smaller than pixels, so that none is passed over.
-        level = math.ceil(math.log2(max(pixel_m / spec.resolution_m, 1.0)) - 1e-9)
-        level = min(level, len(self.levels) - 1)
-        cells = self.levels[level]
-        T_grid_view = (self.T_view_map @ spec.T_frame_grid).inverse()
-        local = T_grid_view.apply(np.column_stack([x_m, y_m])) / (spec.resolution_m * 2**level)
+        level = math.ceil(math.log2(max(pixel_m / resolution_m, 1.0)) - 1e-9)
+        T_grid_view = (self.T_view_map @ self.lattice.T_frame_grid).inverse()
+        local = T_grid_view.apply(np.column_stack([x_m, y_m])) / (resolution_m * 2**level)
         col, row = np.floor(local).astype(np.int64).T
-        inside = (row >= 0) & (col >= 0) & (row < cells.shape[0]) & (col < cells.shape[1])
-        found = np.zeros(len(row), np.uint8)
-        found[inside] = cells[row[inside], col[inside]]
-        return found
+        first = int(row.min()) // SQUARE, int(col.min()) // SQUARE
+        last = int(row.max()) // SQUARE, int(col.max()) // SQUARE
+        size = (last[0] - first[0] + 1) * SQUARE, (last[1] - first[1] + 1) * SQUARE
+        cells = np.zeros(size, np.uint8)
+        for i in range(first[0], last[0] + 1):
+            for j in range(first[1], last[1] + 1):
+                if (i, j) in self._squares(level):
+                    top, left = (i - first[0]) * SQUARE, (j - first[1]) * SQUARE
+                    cells[top : top + SQUARE, left : left + SQUARE] = self._at(level, i, j)
+        return np.asarray(cells[row - first[0] * SQUARE, col - first[1] * SQUARE])
 
-    def bounds(self) -> tuple[float, float, float, float]:
-        """``x_min, y_min, x_max, y_max`` [m] on the page."""
-        return bounds_of(self.occupancy.spec, self.T_view_map)
+    def bounds(self) -> tuple[float, float, float, float] | None:
+        """Rectangle around all squares on the page, as `bounds_of`; None without any."""
+        if not self._known[0]:
+            return None
+        rows, cols = np.array(sorted(self._known[0])).T * SQUARE
+        low, high = (int(rows.min()), int(cols.min())), (int(rows.max()), int(cols.max()))
+        return self.bounds_of_cells(Window(*low, high[0] + SQUARE, high[1] + SQUARE))
+
+    def bounds_of_cells(self, window: Window) -> tuple[float, float, float, float]:
+        """Rectangle around a rectangle of cells on the page, as `bounds_of`."""
+        resolution_m = self.lattice.resolution_m
+        corner = SE2(window.col_0 * resolution_m, window.row_0 * resolution_m)
+        spec = GridSpec(resolution_m, *window.shape, self.lattice.T_frame_grid @ corner)
+        return bounds_of(spec, self.T_view_map)
+
+    def _squares(self, level: int) -> set[tuple[int, int]]:
+        while len(self._known) <= level:
+            self._known.append({(row // 2, col // 2) for row, col in self._known[-1]})
+        return self._known[level]
+
+    def _at(self, level: int, row: int, col: int) -> ByteArray:
+        key = level, row, col
+        if key not in self._made:
+            if level == 0:
+                made = (self._square(row, col).view(np.uint8) + np.uint8(1)).astype(np.uint8)
+            else:
+                fine = np.zeros((2 * SQUARE, 2 * SQUARE), np.uint8)
+                for i in (0, 1):
+                    for j in (0, 1):
+                        child = 2 * row + i, 2 * col + j
+                        if child in self._squares(level - 1):
+                            part = self._at(level - 1, *child)
+                            fine[i * SQUARE :, j * SQUARE :][:SQUARE, :SQUARE] = part
+                pairs = np.maximum(fine[::2], fine[1::2])
+                made = np.maximum(pairs[:, ::2], pairs[:, 1::2])
+            self._made[key] = made
+        return self._made[key]
 
 
 def bounds_of(spec: GridSpec, T_view_frame: SE2) -> tuple[float, float, float, float]:
@@ -98,13 +170,15 @@ def tile_png(layers: Sequence[Layer], zoom: int, col: int, row: int) -> bytes | 
     side_m = TILE_PIXELS * pixel_m
     x_min, y_max = col * side_m, -row * side_m
     centers = (np.arange(TILE_PIXELS) + 0.5) * pixel_m
-    x, y = np.meshgrid(x_min + centers, y_max - centers)
     shown = np.zeros(TILE_PIXELS * TILE_PIXELS, np.uint8)
     for layer in layers:
-        low_x, low_y, high_x, high_y = layer.bounds()
+        bounds = layer.bounds()
+        if bounds is None:
+            continue
+        low_x, low_y, high_x, high_y = bounds
         if low_x < x_min + side_m and high_x > x_min and low_y < y_max and high_y > y_max - side_m:
-            found = layer.sampled(x.ravel(), y.ravel(), pixel_m)
-            shown = np.maximum(shown, found)
+            x, y = np.meshgrid(x_min + centers, y_max - centers)
+            shown = np.maximum(shown, layer.sampled(x.ravel(), y.ravel(), pixel_m))
     if not shown.any():
         return None
     return png_bytes(_COLOURS[shown].reshape(TILE_PIXELS, TILE_PIXELS, 4))

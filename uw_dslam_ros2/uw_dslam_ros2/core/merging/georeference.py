@@ -125,7 +125,7 @@ def pulled_by_fixes(
             found = pull.gathered(start)
             if len(found[0]) > max(1, len(best[0])):
                 best = found
-            if len(best[0]) == len(used):
+            if 2 * len(best[0]) > len(used):
                 break
     members, poses, T_earth_map = best
     # Where no two agree, there are too few to say which is wrong.

@@ -45,6 +45,14 @@ class GlobalMap:
         """The fused map; None without evidence."""
         return self._mosaic.occupancy(self._log_odds_max)
 
+    def squares(self) -> list[tuple[int, int]]:
+        """Which squares of cells there are; see `Mosaic.squares`."""
+        return self._mosaic.squares()
+
+    def square(self, row: int, col: int) -> NDArray[np.int8]:
+        """One of them, in percent, -1 where nothing was seen."""
+        return self._mosaic.square(row, col, self._log_odds_max)
+
     def take_changed(self) -> tuple[GridSpec, Window] | None:
         """What changed since the last call: its place as a grid, and in cells of the lattice."""
         window = self._mosaic.take_changed()

@@ -31,6 +31,7 @@ from uw_dslam_ros2.ros.plumbing.node_settings import ViewConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SERVICES
 from uw_dslam_ros2.ros.plumbing.running import run_node
+from uw_dslam_ros2.view.pace import Pace
 from uw_dslam_ros2.view.queue_source import register_by_engine
 from uw_dslam_ros2.view.server import ViewServer
 from uw_dslam_ros2.view.showing import Register, Showing
@@ -38,6 +39,8 @@ from uw_dslam_ros2.view.showing import Register, Showing
 __all__ = ["View", "main"]
 
 _LEAST_PERIOD_S = 0.2  # between two states that are shown
+_SHARE = 0.2
+"""Of a core, that following a manager may cost: a large merge is followed less often."""
 _ANSWER_WITHIN_S = 20.0
 _SILENT_S = 10.0
 """A manager that says nothing for this long is told; it speaks once a second."""
@@ -166,17 +169,21 @@ class View(Node):
         self._board.note(msg, time.monotonic())
 
     def _follow(self) -> None:
+        pace = Pace(_SHARE)
         while not self._is_stopped.is_set():
             self._is_new.wait()
             self._is_new.clear()
             status = self._status
             if self._is_stopped.is_set() or status is None:
                 continue
+            pace.begin(time.monotonic())
+            begun_s = time.thread_time()
             try:
                 self._show(status)
             except (InvalidInputError, TimeoutError) as error:
                 self.get_logger().warning(f"cannot show the newest state: {error}")
-            self._is_stopped.wait(_LEAST_PERIOD_S)
+            pace.spend(time.thread_time() - begun_s)
+            self._is_stopped.wait(max(_LEAST_PERIOD_S, pace.wait_s(time.monotonic())))
 
     def _show(self, status: MergeStatus) -> None:
         records = []
