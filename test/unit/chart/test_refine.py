@@ -47,7 +47,7 @@ def test_paths_come_nearer_to_the_truth(seed):
     true = [there_and_back(7.0), there_and_back(13.0)]
     tracks = [Track(drifted(p, rng), [echoes_of_room(q, rng) for q in p]) for p in true]
     before = error_m([t.poses for t in tracks], true)
-    after = error_m(refine_tracks(tracks, 0.05, 0.8), true)
+    after = error_m([found.poses for found in refine_tracks(tracks, 0.05, 0.8)], true)
     assert after < 0.7 * before
 
 
@@ -56,7 +56,30 @@ def test_what_agrees_already_stays():
     true = there_and_back(8.0)
     track = Track(true, [echoes_of_room(q, rng) for q in true])
     (found,) = refine_tracks([track], 0.05, 0.8)
-    assert np.abs(found[:, :2] - true[:, :2]).max() < 0.05
+    assert np.abs(found.poses[:, :2] - true[:, :2]).max() < 0.05
+    assert abs(found.mounting_rad) < 0.002
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_instruments_that_are_wrong_all_the_time_are_found(seed):
+    """A log that says too much by 1 %, a sonar that is turned on the vehicle by 0.6 degrees."""
+    rng = np.random.default_rng(seed)
+    true = [there_and_back(7.0), there_and_back(13.0)]
+    turned_rad = np.radians(0.6)
+    tracks = [
+        Track(
+            p * [1.01, 1.01, 1.0],
+            [echoes_of_room(q, rng) for q in p + np.array([0.0, 0.0, turned_rad])],
+            drift_m=0.01,
+            drift_rad=0.001,
+        )
+        for p in true
+    ]
+    found = refine_tracks(tracks, 0.05, 0.8)
+    before = error_m([t.poses for t in tracks], true)
+    assert error_m([f.poses for f in found], true) < 0.5 * before
+    for track in found:
+        assert track.mounting_rad == pytest.approx(turned_rad, abs=0.2 * turned_rad)
 
 
 def test_the_same_frame_elsewhere_gives_the_same_walls():
@@ -67,13 +90,13 @@ def test_the_same_frame_elsewhere_gives_the_same_walls():
     moved = Track(track.poses + T.as_array(), track.echoes)
     (here,), (there,) = refine_tracks([track], 0.05, 0.8), refine_tracks([moved], 0.05, 0.8)
     # Blocks lie elsewhere on the walls, so not to the last digit.
-    assert np.abs(there - T.as_array() - here)[:, :2].max() < 0.03
+    assert np.abs(there.poses - T.as_array() - here.poses)[:, :2].max() < 0.03
 
 
 def test_pings_without_echoes_stay_where_they_are():
     poses = there_and_back(8.0)[:10]
     (found,) = refine_tracks([Track(poses, [np.empty((0, 2))] * 10)], 0.05, 0.8)
-    np.testing.assert_array_equal(found, poses)
+    np.testing.assert_array_equal(found.poses, poses)
 
 
 @pytest.mark.parametrize(("scale", "expected"), [(1.03, 1.0 / 1.03), (1.0, 1.0), (0.97, 1.0)])

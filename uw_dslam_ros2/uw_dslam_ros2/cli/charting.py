@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.se2 import wrap_angle
-from uw_dslam_ros2.core.submap import SubmapId, Track
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["PingTracks", "chart_tracks", "charted"]
 
@@ -77,7 +79,7 @@ def chart_tracks(outcome: Outcome, pings: Pings) -> tuple[PingTracks, PingTracks
     return before, dict(zip(before, after, strict=True))
 
 
-def _tracks_of(records: Iterable[SubmapRecord], pings: Pings) -> PingTracks:
+def _tracks_of(records: Sequence[SubmapRecord], pings: Pings) -> PingTracks:
     """Pings of each run's merged submaps, where the settled graph places them."""
     kept: dict[Track, list[DrawnPing]] = {}
     poses: dict[Track, list[FloatArray]] = {}
@@ -89,7 +91,27 @@ def _tracks_of(records: Iterable[SubmapRecord], pings: Pings) -> PingTracks:
             pose = record.T_component_submap @ ping.T_submap_sonar
             kept.setdefault(submap_id.track, []).append(ping)
             poses.setdefault(submap_id.track, []).append(pose.as_array())
-    return {track: PingTrack(kept[track], np.array(poses[track])) for track in kept}
+    return {
+        track: PingTrack(
+            kept[track],
+            np.array(poses[track]),
+            **_drift([r.submap for r in records if r.submap.submap_id.track == track]),
+        )
+        for track in kept
+    }
+
+
+def _drift(submaps: Sequence[Submap]) -> dict[str, float]:
+    """What navigation says a path gains on one metre, of a run's submaps in their order."""
+    found = []
+    for before, after in itertools.pairwise(submaps):
+        way_m = float(np.hypot(*np.diff(before.trajectory[:, :2], axis=0).T).sum())
+        if after.sequence == before.sequence + 1 and way_m > 0.0:
+            found.append(np.diag(after.covariance) / way_m)
+    if not found:
+        return {}
+    x, y, yaw = np.median(found, axis=0)
+    return {"drift_m": math.sqrt(0.5 * (x + y)), "drift_rad": math.sqrt(yaw)}
 
 
 def _bent(vehicle: VehicleOutcome, before: PingTracks, after: PingTracks) -> VehicleOutcome:
@@ -110,8 +132,7 @@ def _bent(vehicle: VehicleOutcome, before: PingTracks, after: PingTracks) -> Veh
 
 
 def _moved(before: PingTrack, after: PingTrack) -> FloatArray:
-    """How each pose (K, 3) changes; a turn of all alike is the sonar's mounting, no heading."""
+    """How each pose (K, 3) of the vehicle changes; the sonar's turn on it is no heading."""
     moved = after.T_map_sonar - before.T_map_sonar
-    moved[:, 2] = wrap_angle(moved[:, 2])
-    moved[:, 2] -= moved[:, 2].mean()
+    moved[:, 2] = wrap_angle(moved[:, 2] - after.mounting_rad)
     return moved

@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.chart.pings import DrawnPing
-from uw_dslam_ros2.core.chart.refine import Track, range_scales, refine_tracks
+from uw_dslam_ros2.core.chart.refine import (
+    DRIFT_M,
+    DRIFT_RAD,
+    Track,
+    range_scales,
+    refine_tracks,
+)
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
@@ -31,12 +37,17 @@ _ROUNDED = 5
 class PingTrack:
     """Pings of one vehicle in order of time, and ``T_map_sonar`` (K, 3) of each.
 
-    Ranges are drawn times ``range_scale``.
+    Ranges are drawn times ``range_scale``. ``drift_m`` and ``drift_rad`` are what the path gains
+    on one metre (standard deviations); ``mounting_rad`` is the turn of the sonar on its vehicle
+    that is in the poses but not in the recording.
     """
 
     pings: Sequence[DrawnPing]
     T_map_sonar: FloatArray
     range_scale: float = 1.0
+    drift_m: float = DRIFT_M
+    drift_rad: float = DRIFT_RAD
+    mounting_rad: float = 0.0
 
     def __post_init__(self) -> None:
         expected = (len(self.pings), 3)
@@ -54,7 +65,15 @@ class PingTrack:
 def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]:
     """The same pings where all of them see the same walls; see `refine_tracks`."""
     block_m = _BLOCK_M + _BLOCK_CELLS * resolution_m
-    paths = [Track(t.T_map_sonar, [p.points for p in t.pings]) for t in tracks]
+    paths = [
+        Track(
+            t.T_map_sonar,
+            [p.points for p in t.pings],
+            drift_m=min(t.drift_m, DRIFT_M),
+            drift_rad=min(t.drift_rad, DRIFT_RAD),
+        )
+        for t in tracks
+    ]
     scales = range_scales(paths, resolution_m, block_m)
     scaled = [
         dataclasses.replace(path, range_scale=scale)
@@ -62,8 +81,13 @@ def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]
     ]
     found = refine_tracks(scaled, resolution_m, block_m)
     return [
-        PingTrack(track.pings, np.round(poses, _ROUNDED), round(scale, _ROUNDED))
-        for track, poses, scale in zip(tracks, found, scales, strict=True)
+        dataclasses.replace(
+            track,
+            T_map_sonar=np.round(path.poses, _ROUNDED),
+            range_scale=round(scale, _ROUNDED),
+            mounting_rad=round(path.mounting_rad, _ROUNDED),
+        )
+        for track, path, scale in zip(tracks, found, scales, strict=True)
     ]
 
 

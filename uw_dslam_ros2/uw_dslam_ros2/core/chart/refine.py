@@ -4,7 +4,9 @@ Echoes of one small block of the plane that lie along a line are one wall, whoev
 far each lies from that wall is made small over all poses at once; the walls' places are eliminated
 and need not be known (bundle adjustment on eigenvalues: Liu and Zhang 2021, IEEE RA-L 6(2); poses
 and map together: Wang et al. 2022, Occupancy-SLAM). What navigation says of the way from ping to
-ping keeps the path stiff.
+ping keeps the path stiff: where it turns, all that follows swings round. What is wrong with an
+instrument all the time has unknowns of its own: how the sonar is turned on the vehicle, and a
+factor on the way.
 """
 
 from __future__ import annotations
@@ -18,19 +20,22 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
-__all__ = ["Track", "range_scales", "refine_tracks"]
+__all__ = ["DRIFT_M", "DRIFT_RAD", "Refined", "Track", "range_scales", "refine_tracks"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _NODE_M = 2.0
 """A path bends at nodes this far apart."""
-_BEND_SIGMA_M, _BEND_SIGMA_RAD = 0.04, 0.004
-"""How much one node's correction differs from the next one's."""
+DRIFT_M, DRIFT_RAD = 0.03, 0.003
+"""How far a path and its heading drift on one metre, at most; they grow with the way's root."""
+_WAY_SIGMA, _MOUNTING_SIGMA_RAD = 0.01, 0.01
+"""Of the way, by a velocity log's scale; of the sonar's yaw on the vehicle."""
 _ANCHOR_SIGMA_M, _ANCHOR_SIGMA_RAD = 0.5, 0.02
 _STRETCH_SIGMA, _MIN_STRETCH = 0.02, 0.01
 """Of ranges, by a speed of sound that nobody set; what is less may come of thick echoes."""
-_NO_STRETCH = 1e-6
+_NOTHING = 1e-6
+"""Standard deviation of what is not asked."""
 _INFORMATION_SHARE = 0.1
 """Neighbouring echoes err together."""
 _ITERATIONS = 10
@@ -45,18 +50,34 @@ _MAX_FLATNESS = 0.15
 class Track:
     """Pings of one vehicle in order: ``T_map_sonar`` (K, 3), and each one's echoes (N, 2) [m].
 
-    Ranges count times ``range_scale``.
+    Ranges count times ``range_scale``. ``drift_m`` and ``drift_rad`` are the standard deviations
+    of what the path gains on one metre.
     """
 
     poses: FloatArray
     echoes: Sequence[NDArray[np.floating]]
     range_scale: float = 1.0
+    drift_m: float = DRIFT_M
+    drift_rad: float = DRIFT_RAD
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """``T_map_sonar`` (K, 3) of one track's pings, and the turn of its sonar that is in it."""
+
+    poses: FloatArray
+    mounting_rad: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """All echoes in arrays; ``node`` (K,) and ``share`` (K,) place pings between nodes."""
+    """All echoes in arrays; ``node`` (K,) and ``share`` (K,) place pings between nodes.
 
+    Unknowns are the bends of all nodes (3 M,), then of all tracks (T,) the stretch of ranges, the
+    stretch of the way, and the sonar's turn.
+    """
+
+    tracks: Sequence[Track]
     poses: FloatArray
     track: IntArray
     node: IntArray
@@ -70,11 +91,17 @@ class _Problem:
     def num_nodes(self) -> int:
         return len(self.node_track)
 
+    def stretches(self, found: FloatArray) -> FloatArray:
+        """Of ranges (T,)."""
+        return found[3 * self.num_nodes :][: len(self.tracks)]
 
-def refine_tracks(tracks: Sequence[Track], noise_m: float, block_m: float) -> list[FloatArray]:
+    def turns(self, found: FloatArray) -> FloatArray:
+        """Of the sonars (T,)."""
+        return found[-len(self.tracks) :]
+
+
+def refine_tracks(tracks: Sequence[Track], noise_m: float, block_m: float) -> list[Refined]:
     """Bend several vehicles' paths in one frame until their echoes meet on common walls.
-
-    Returns ``T_map_sonar`` (K, 3) of each track.
 
     Parameters
     ----------
@@ -87,10 +114,10 @@ def refine_tracks(tracks: Sequence[Track], noise_m: float, block_m: float) -> li
     """
     problem = _arranged(tracks, _MAX_ECHOES)
     if len(problem.echo) == 0:
-        return [track.poses for track in tracks]
-    found = _solved(problem, noise_m, block_m, stretch_sigma=0.0)
-    poses = problem.poses + _bends(problem, found)
-    return [poses[problem.track == t] for t in range(len(tracks))]
+        return [Refined(track.poses, 0.0) for track in tracks]
+    found = _solved(problem, _prior(problem, way_sigma=_WAY_SIGMA), noise_m, block_m)
+    poses, turns = problem.poses + _bends(problem, found), problem.turns(found)
+    return [Refined(poses[problem.track == t], float(turns[t])) for t in range(len(tracks))]
 
 
 def range_scales(tracks: Sequence[Track], noise_m: float, block_m: float) -> list[float]:
@@ -104,16 +131,14 @@ def range_scales(tracks: Sequence[Track], noise_m: float, block_m: float) -> lis
     problem = _arranged(tracks, _FEW_ECHOES)
     if len(problem.echo) == 0:
         return [1.0] * len(tracks)
-    found = _solved(problem, noise_m, block_m, _STRETCH_SIGMA)
-    stretches = found[3 * problem.num_nodes :]
+    found = _solved(problem, _prior(problem, stretch_sigma=_STRETCH_SIGMA), noise_m, block_m)
+    stretches = problem.stretches(found)
     return [1.0 + float(s) if s < -_MIN_STRETCH else 1.0 for s in stretches]
 
 
-def _solved(problem: _Problem, noise_m: float, block_m: float, stretch_sigma: float) -> FloatArray:
-    """Bends of all nodes (3 M,), then stretches of all tracks (T,)."""
-    num_tracks = int(problem.node_track.max()) + 1
-    found = np.zeros(3 * problem.num_nodes + num_tracks)
-    prior = _prior(problem, num_tracks, max(stretch_sigma, _NO_STRETCH))
+def _solved(problem: _Problem, prior: sp.csr_matrix, noise_m: float, block_m: float) -> FloatArray:
+    """All unknowns; see `_Problem`."""
+    found = np.zeros(prior.shape[1])
     for iteration in range(_ITERATIONS):
         shift = 0.5 * block_m * (iteration % 2)
         width = max(noise_m, 0.25 * block_m * 0.6**iteration)
@@ -143,6 +168,7 @@ def _arranged(tracks: Sequence[Track], max_echoes: int) -> _Problem:
             echoes.append(kept)
             num_pings += 1
     return _Problem(
+        tracks,
         np.vstack([track.poses for track in tracks]),
         np.repeat(np.arange(len(tracks)), [len(track.poses) for track in tracks]),
         np.concatenate(nodes),
@@ -158,22 +184,44 @@ def _bends(problem: _Problem, found: FloatArray) -> FloatArray:
     """Correction (K, 3) of each ping: a shift of its place, and a turn about it."""
     bend = found[: 3 * problem.num_nodes].reshape(-1, 3)
     share = problem.share[:, None]
-    return (1.0 - share) * bend[problem.node] + share * bend[problem.node + 1]
+    correction = (1.0 - share) * bend[problem.node] + share * bend[problem.node + 1]
+    correction[:, 2] += problem.turns(found)[problem.track]
+    return correction
 
 
-def _prior(problem: _Problem, num_tracks: int, stretch_sigma: float) -> sp.csr_matrix:
-    """Square root of the information on the nodes, x, y, yaw of each, and on the stretches."""
-    same = np.flatnonzero(problem.node_track[1:] == problem.node_track[:-1])
-    ones = np.ones(len(same))
-    places = (np.tile(np.arange(len(same)), 2), np.concatenate([same, same + 1]))
-    differences = sp.csr_matrix(
-        (np.concatenate([-ones, ones]), places), (len(same), problem.num_nodes)
-    )
-    bends = sp.kron(differences, np.diag([1 / _BEND_SIGMA_M] * 2 + [1 / _BEND_SIGMA_RAD]))
-    anchor = np.tile([1 / _ANCHOR_SIGMA_M] * 2 + [1 / _ANCHOR_SIGMA_RAD], problem.num_nodes)
-    nodes = sp.vstack([bends, sp.diags(anchor / math.sqrt(problem.num_nodes))])
-    stretches = sp.identity(num_tracks) / stretch_sigma
-    return sp.block_diag([nodes, stretches]).tocsr()
+def _prior(
+    problem: _Problem, *, stretch_sigma: float = _NOTHING, way_sigma: float = _NOTHING
+) -> sp.csr_matrix:
+    """Square root (rows, unknowns) of the information that there is without any echo."""
+    num_tracks, num_nodes = len(problem.tracks), problem.num_nodes
+    first = np.flatnonzero(problem.node_track[1:] == problem.node_track[:-1])
+    track = problem.node_track[first]
+    step = problem.node_centers[first + 1] - problem.node_centers[first]
+    nothing = np.zeros(len(first))
+    ones = np.ones(len(first))
+    rows = []
+    # A node is moved as the one before it, and as the way between them turns and stretches.
+    for axis, swing in ((0, -step[:, 1]), (1, step[:, 0]), (2, nothing)):
+        along = step[:, axis] if axis < 2 else nothing
+        columns = (3 * first + axis, 3 * first + 3 + axis, 3 * first + 2, 3 * first + 5)
+        values = (-ones, ones, -0.5 * swing, -0.5 * swing)
+        of_way = 3 * num_nodes + num_tracks + track
+        rows.append(
+            sp.csr_matrix(
+                (
+                    np.concatenate([*values, -along]),
+                    (np.tile(np.arange(len(first)), 5), np.concatenate([*columns, of_way])),
+                ),
+                (len(first), 3 * num_nodes + 3 * num_tracks),
+            )
+        )
+    drift = np.array([(t.drift_m, t.drift_m, t.drift_rad) for t in problem.tracks])
+    weight = 1.0 / (math.sqrt(_NODE_M) * drift[track])
+    bends = [sp.diags(weight[:, axis]) @ rows[axis] for axis in range(3)]
+    anchor = np.tile([1 / _ANCHOR_SIGMA_M] * 2 + [1 / _ANCHOR_SIGMA_RAD], num_nodes)
+    of_tracks = np.repeat([1 / stretch_sigma, 1 / way_sigma, 1 / _MOUNTING_SIGMA_RAD], num_tracks)
+    own = sp.diags(np.concatenate([anchor / math.sqrt(num_nodes), of_tracks]))
+    return sp.vstack([*bends, own]).tocsr()
 
 
 def _step(
@@ -185,9 +233,9 @@ def _step(
     noise_m: float,
     width_m: float,
 ) -> FloatArray:
-    """One Gauss-Newton step (3 M + T,): of all nodes, then of all tracks' stretches."""
+    """One Gauss-Newton step of all unknowns."""
     poses = problem.poses + _bends(problem, found)
-    stretch = found[3 * problem.num_nodes :]
+    stretch = problem.stretches(found)
     ping = problem.ping
     ex, ey = problem.echo.T * (1.0 + stretch[problem.track[ping]])
     cos, sin = np.cos(poses[ping, 2]), np.sin(poses[ping, 2])
@@ -208,9 +256,12 @@ def _step(
     node, share = problem.node[point_ping], problem.share[point_ping]
     by_node = np.column_stack([n, turn])
     track = problem.track[point_ping]
-    columns = np.column_stack([3 * node[:, None] + np.arange(6), 3 * problem.num_nodes + track])
+    of_range = 3 * problem.num_nodes + track
+    of_turn = len(found) - len(problem.tracks) + track
+    columns = np.column_stack([3 * node[:, None] + np.arange(6), of_range, of_turn])
     outward = (n * arm).sum(axis=1) / (1.0 + stretch[track])
-    values = np.column_stack([(1.0 - share)[:, None] * by_node, share[:, None] * by_node, outward])
+    share = share[:, None]
+    values = np.column_stack([(1.0 - share) * by_node, share * by_node, outward, turn])
     rows = np.repeat(np.arange(len(keep)), columns.shape[1])
     shape = (len(keep), len(found))
     jacobian = sp.csr_matrix((values.ravel(), (rows, columns.ravel())), shape)
