@@ -1,5 +1,8 @@
 """The study of the merging scores what it is given: truth is without error, a shift is not."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,14 +58,36 @@ def test_who_stayed_apart_is_named_with_what_was_in_common(mission, fleet):
     assert merging._row(mission, "all", placing, 0, 0.0)["apart"] == ""
     without = {submap_id: T for submap_id, T in placing.items() if submap_id[0] != "auv_02"}
     told = merging._row(mission, "two", without, 0, 0.0)["apart"]
-    name, share = told.removesuffix(" in common").split()
-    assert name == "auv_02"
-    shares = [
+    found = re.fullmatch(
+        r"auv_02 has (\d+)% of the area and (\d+)% of its walls in common, "
+        r"asked near the truth ACCEPTED at (\S+)",
+        told,
+    )
+    assert found
+    area, walls, probability = map(float, found.groups())
+    # Lanes side by side: the largest share of one submap in another is less than of all in all.
+    largest = max(
         known_overlap(fleet.submaps[a].grid, fleet.submaps[b].grid,
                       placing[b].inverse() @ placing[a])
         for a in placing if a[0] == "auv_02" for b in without
-    ]  # fmt: skip
-    assert share == f"{max(shares):.0%}"
+    )  # fmt: skip
+    assert 100.0 * largest <= area <= 100.0
+    assert 0.0 < walls <= 100.0
+    assert probability >= 0.75
+
+
+def test_who_shares_water_and_no_wall_is_told_so(mission):
+    """One vehicle's map without its walls: all of the area is in common, and nothing else."""
+    placing = merging._true_placing(mission)
+    without = {submap_id: T for submap_id, T in placing.items() if submap_id[0] != "auv_02"}
+    blind = tuple(
+        replace(s, grid=replace(s.grid, values=np.where(s.grid.values > 50, 0, s.grid.values)))
+        if s.vehicle_id == "auv_02" else s
+        for s in mission.submaps
+    )  # fmt: skip
+    told = merging._row(replace(mission, submaps=blind), "two", without, 0, 0.0)["apart"]
+    assert "ACCEPTED" not in told
+    assert told.startswith("auv_02 has ")
 
 
 def test_methods_share_the_queue_and_differ_in_what_answers(mission, fleet):

@@ -13,7 +13,6 @@ merged too, as three vehicles.
 from __future__ import annotations
 
 import argparse
-import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -53,7 +52,7 @@ from uw_dslam_ros2.core.metrics import (
     trajectory_error,
 )
 from uw_dslam_ros2.core.mosaic import fuse_maps
-from uw_dslam_ros2.core.registration import RegistrationResult, register_grids
+from uw_dslam_ros2.core.registration import PriorWindow, RegistrationResult, register_grids
 from uw_dslam_ros2.core.registration.baselines.icp import many_start_icp
 from uw_dslam_ros2.core.registration.baselines.ndt import ndt
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig
@@ -75,6 +74,7 @@ _LOG_ODDS_MAX = 8.0
 _MAX_POINTS = 500
 _NUM_HEADINGS = 24
 _MAX_BOXES_OF_PAPER = 300_000  # its objective on maps' points hardly ever closes its gap
+_NEAR = (2.0, np.radians(5.0))  # [m], [rad]: the window about the true pose
 _SCORES = ("rmse_m", "rmse_deg", "mse", "ssim", "iou")
 
 
@@ -287,17 +287,26 @@ def _row(
 
 
 def _apart(mission: FleetMission, placing: Placing) -> str:
-    """Who is not in a group, and the greatest share truly in common with who is."""
+    """Who is not in a group; what there was in common, by the truth, and could it be told.
+
+    Seen area says little: two vehicles may see one stretch of water and walls on either side of
+    it. So the walls in common are told as well, and the verdict on a search that begins at the
+    true pose.
+    """
     truth = _true_placing(mission)
-    grids = {s.submap_id: s.grid for s in mission.submaps if s.submap_id in truth}
     joined = {submap_id[0] for submap_id in placing}
-    shares: dict[str, float] = {}
-    for one, other in itertools.product(grids, grids):
-        if one[0] not in joined and other in placing:
-            motion = truth[other].inverse() @ truth[one]
-            share = known_overlap(grids[one], grids[other], motion)
-            shares[one[0]] = max(share, shares.get(one[0], 0.0))
-    return ", ".join(f"{name} {share:.0%} in common" for name, share in sorted(shares.items()))
+    others = _fused([s for s in mission.submaps if s.submap_id in placing], truth)
+    told = []
+    for name in sorted({submap_id[0] for submap_id in truth} - joined):
+        own = _fused([s for s in mission.submaps if s.vehicle_id == name], truth)
+        area = known_overlap(own, others, SE2(0.0, 0.0, 0.0))
+        walls = compare_maps(own, others, tolerance_m=WALL_TOLERANCE_M).wall_precision
+        near = register_grids(own, others, prior=PriorWindow(SE2(0.0, 0.0, 0.0), *_NEAR))
+        told.append(
+            f"{name} has {area:.0%} of the area and {walls:.0%} of its walls in common, "
+            f"asked near the truth {near.verdict.name} at {near.probability:.2f}"
+        )
+    return "; ".join(told)
 
 
 def _trajectories(submaps: list[Submap], placing: Placing) -> Mapping[str, Trajectory]:
