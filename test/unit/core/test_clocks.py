@@ -62,7 +62,7 @@ def test_a_sensor_that_is_only_slow_is_left_alone():
     assert findings == []
 
 
-@pytest.mark.parametrize("jump_s", [-40.0, -2.0, 3600.0])
+@pytest.mark.parametrize("jump_s", [-40.0, -2.0, 2.0, 3600.0])
 def test_a_clock_that_is_set_in_mid_mission_is_set_back(jump_s):
     def jumped(stamps):
         return stamps + np.where(stamps > START + 60 * SECOND, int(jump_s), 0) * SECOND
@@ -76,6 +76,27 @@ def test_a_clock_that_is_set_in_mid_mission_is_set_back(jump_s):
     late = truth["imu"] > START + 61 * SECOND
     moved = {int(d) for d in np.unique((stamps["imu"] - streams["imu"].stamp_ns)[late])}
     assert len(moved) == 1
+
+
+def test_messages_that_are_held_up_are_no_jump():
+    streams, truth = vehicle()
+    for held_s in (0.5, 3.0):
+        recorded = streams["imu"].recorded_ns.copy()
+        until = recorded[1000] + int(held_s * SECOND)
+        recorded[1000:] = np.maximum(recorded[1000:], until)  # then all at once
+        held = StreamTimes(streams["imu"].stamp_ns, recorded)
+        stamps, findings = corrected_clocks({**streams, "imu": held})
+        assert findings == []
+        assert worst_s(stamps, truth) == 0.0
+
+
+def test_of_messages_that_come_irregularly_only_a_far_jump_is_believed():
+    streams, _ = vehicle()
+    rng = np.random.default_rng(5)
+    lag = rng.uniform(0.0, 3.0, len(streams["sonar"].recorded_ns))
+    recorded = np.sort(streams["sonar"].recorded_ns + (lag * SECOND).astype(np.int64))
+    sonar = StreamTimes(streams["sonar"].stamp_ns, recorded)
+    assert corrected_clocks({**streams, "sonar": sonar})[1] == []
 
 
 def test_one_late_message_is_no_jump():

@@ -18,6 +18,9 @@ _SECOND_NS = 1_000_000_000
 _JUMP_BACK_S = 1.0
 """Stamps of one sensor never go back by more, unless its clock is set."""
 _JUMP_AHEAD_S = 5.0
+"""They may go ahead by less where messages are held up, or by more than `_JUMP_BACK_S` where each
+takes as long as the last."""
+_STEADY_S = 0.05
 _SAME_JUMP_S = 0.5
 _MAX_DRIFT = 0.2
 """Share by which times of recording that were taken live may go slower or faster than stamps."""
@@ -142,7 +145,8 @@ def _jumps(times: StreamTimes) -> list[tuple[int, int]]:
     step_ns = np.diff(stamp_ns)
     excess_ns = step_ns - np.diff(recorded_ns)
     is_back = (step_ns < -_JUMP_BACK_S * _SECOND_NS) & (excess_ns < -_JUMP_BACK_S * _SECOND_NS)
-    is_ahead = excess_ns > _JUMP_AHEAD_S * _SECOND_NS
+    is_steady = len(excess_ns) > 0 and np.median(np.abs(excess_ns)) < _STEADY_S * _SECOND_NS
+    is_ahead = excess_ns > (_JUMP_BACK_S if is_steady else _JUMP_AHEAD_S) * _SECOND_NS
     ahead_ns = stamp_ns - recorded_ns
     others_ns = excess_ns[~(is_back | is_ahead)]
     span_ns = int(recorded_ns[-1] - recorded_ns[0])
