@@ -1,8 +1,13 @@
 """Bursts show the turns and the whole recording; more pings are taken where some tell."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from uw_dslam_ros2.core.doctor.bursts import choose_pings, more_pings
+from uw_dslam_ros2.core.doctor.fits import TurnFit, confidence_of
+from uw_dslam_ros2.core.doctor.ping_motion import PingMotions
 
 PINGS_S = np.arange(0.0, 600.0, 0.33)
 IMU_S = np.arange(0.0, 600.0, 0.05)
@@ -52,3 +57,21 @@ def test_no_more_pings_are_taken_where_most_tell_or_none_does():
 
 def test_pings_too_seldom_show_nothing():
     assert len(choose_pings(np.arange(0.0, 100.0, 2.5), IMU_S, np.sin(IMU_S))) == 0
+
+
+def test_motions_of_the_same_moment_count_once():
+    def motions(begin_s):
+        begin = np.array(begin_s)
+        return PingMotions(begin, begin + 1.0, np.zeros((len(begin), 3)), np.empty((0, 3, 3)))
+
+    assert motions([0.0, 1.0, 2.0, 9.0]).repeats == 1.0
+    assert motions([0.0, 0.5, 1.0, 1.5, 2.0]).repeats == pytest.approx(5.0 / 3.0)
+    assert motions([]).repeats == 1.0
+
+
+def test_what_is_seen_twice_is_not_twice_as_sure():
+    cost = np.array([0.1, 0.2, 0.1, 0.3])
+    once = TurnFit(1, 0.0, cost), TurnFit(-1, 0.0, cost + 1.0)
+    thrice = [replace(fit, cost=np.repeat(fit.cost, 3), repeats=3.0) for fit in once]
+    assert confidence_of(*thrice) == pytest.approx(confidence_of(*once))
+    assert confidence_of(*reversed(once)) < 0.5 < confidence_of(*once)

@@ -52,7 +52,7 @@ def find_delays(
     """
     best, still = turns[0], turns[2]
     against_imu_s = best.delay_s
-    by_turns = confidence_of(best.cost, still.cost)
+    by_turns = confidence_of(best, still)
     if abs(against_imu_s) < _MIN_TURN_DELAY_S or by_turns < sure:
         against_imu_s = 0.0
     together = way(0.0)
@@ -62,13 +62,13 @@ def find_delays(
         moved, moved_s = _best(way)
         if moved is None or abs(moved_s) < _MIN_WAY_DELAY_S:
             return Delays()
-        by_way = confidence_of(moved.cost, together.cost)
+        by_way = confidence_of(moved, together)
         return Delays(velocity_s=moved_s, confidence=by_way) if by_way > likely else Delays()
     # The sonar and the IMU differ: the DVL goes with one of them.
     with_sonar = way(against_imu_s)
     is_imu = 0.5
     if together is not None and with_sonar is not None:
-        is_imu = confidence_of(with_sonar.cost, together.cost)
+        is_imu = confidence_of(with_sonar, together)
     owner = max(is_imu, 1.0 - is_imu)
     is_known, confidence = owner > sure, min(by_turns, owner)
     if is_imu > 0.5:

@@ -188,7 +188,7 @@ class _Trial:
     # -------------------------------------------------------------------------------------------
 
     def _say_one_flipped(self, rates: int, orientation: int, fits: list[TurnFit]) -> None:
-        sure = confidence_of(fits[0].cost, fits[1].cost)
+        sure = confidence_of(fits[0], fits[1])
         if orientation < 0:
             self._add(
                 "imu_ned",
@@ -214,7 +214,7 @@ class _Trial:
         sonar, imu = (self._fit(reading) for reading in readings)
         sure = 0.5
         if sonar is not None and imu is not None:
-            sure = confidence_of(sonar.cost, imu.cost)
+            sure = confidence_of(sonar, imu)
         if sonar is not None and sure > _SURE:
             self._add(
                 "sonar_mirrored",
@@ -261,7 +261,7 @@ class _Trial:
         plain, mirrored = self._fit(reading), self._fit(other)
         if plain is None or mirrored is None:
             return reading
-        self._side_confidence = confidence_of(mirrored.cost, plain.cost)
+        self._side_confidence = confidence_of(mirrored, plain)
         return other if self._side_confidence > _SURE else reading
 
     def _say_velocity_mirrored(self, fit: VelocityFit) -> None:

@@ -38,11 +38,15 @@ _MAX_TURN_COST = 1.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnFit:
-    """Turns by navigation against those by echoes: ``cost`` (M,) of each ping motion."""
+    """Turns by navigation against those by echoes: ``cost`` (M,) of each ping motion.
+
+    ``repeats`` is how many motions tell of the same moment.
+    """
 
     sign: int
     delay_s: float
     cost: FloatArray
+    repeats: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +62,7 @@ class VelocityFit:
     factor_sigma: float
     is_mirrored: bool
     cost: FloatArray
+    repeats: float = 1.0
 
     @property
     def yaw_rad(self) -> float:
@@ -122,10 +127,10 @@ def fit_turns(
         around = delays[best] + np.arange(-0.04, 0.041, 0.01)
         fine = [_turn_cost(motions, imu_s, yaw_rad, sign, d) for d in around]
         chosen = int(np.argmin([c.sum() for c in fine]))
-        fits.append(TurnFit(sign, float(around[chosen]), fine[chosen]))
+        fits.append(TurnFit(sign, float(around[chosen]), fine[chosen], motions.repeats))
     fits.sort(key=lambda fit: float(fit.cost.sum()))
     still = _turn_cost(motions, imu_s, yaw_rad, fits[0].sign, 0.0)
-    return [*fits, TurnFit(fits[0].sign, 0.0, still)]
+    return [*fits, TurnFit(fits[0].sign, 0.0, still, motions.repeats)]
 
 
 def believed(fits: list[TurnFit]) -> list[TurnFit] | None:
@@ -133,7 +138,7 @@ def believed(fits: list[TurnFit]) -> list[TurnFit] | None:
     best, other = fits[0], fits[1]
     if not len(best.cost) or float(np.mean(best.cost)) > _MAX_TURN_COST:
         return None
-    return fits if confidence_of(best.cost, other.cost) > _SURE else None
+    return fits if confidence_of(best, other) > _SURE else None
 
 
 def turn_bias(
@@ -148,7 +153,7 @@ def turn_bias(
     middle = float(np.median(rates))
     # That of a median of normal values, by the median deviation.
     spread = 1.48 * float(np.median(np.abs(rates - middle)))
-    return fit.sign * middle, 1.25 * spread / math.sqrt(len(rates))
+    return fit.sign * middle, 1.25 * spread / math.sqrt(len(rates) / motions.repeats)
 
 
 def fit_velocity(
@@ -204,7 +209,8 @@ def fit_velocity(
     factor, sigma, cost = _solve(predicted[usable], seen[usable], weight[usable])
     costs = np.full(len(motions), np.nan)
     costs[usable] = cost
-    return VelocityFit(factor, sigma, is_velocity_mirrored, costs)
+    sigma *= math.sqrt(motions.repeats)
+    return VelocityFit(factor, sigma, is_velocity_mirrored, costs, motions.repeats)
 
 
 def _path(
@@ -252,11 +258,12 @@ def _solve(
     return complex(factor[0], factor[1]), sigma, _robust(squares)
 
 
-def confidence_of(better: FloatArray, worse: FloatArray) -> float:
+def confidence_of[FitT: (TurnFit, VelocityFit)](better: FitT, worse: FitT) -> float:
     """How sure it is that the lower costs (M,) are no chance, 0.5 to 1.
 
-    A cost is a negative log-likelihood; neighbouring motions err together, so two count as one.
+    A cost is a negative log-likelihood; neighbouring motions err together, so two count as one,
+    and those of the same moment as half of one.
     """
-    both = np.isfinite(better) & np.isfinite(worse)
-    lead = float((worse[both] - better[both]).sum()) / 2.0
+    both = np.isfinite(better.cost) & np.isfinite(worse.cost)
+    lead = float((worse.cost[both] - better.cost[both]).sum()) / (2.0 * better.repeats)
     return float(scipy.special.expit(lead))

@@ -107,7 +107,7 @@ class _Judge:
             return
         sign, owner = turns[0].sign, ""
         if sign < 0:
-            owner = self._say_mirrored(confidence_of(turns[0].cost, turns[1].cost))
+            owner = self._say_mirrored(confidence_of(turns[0], turns[1]))
         if not is_alone:
             return
         self._judge_delay(turns)
@@ -196,7 +196,7 @@ class _Judge:
         self._result.add(finding, odometry="ned")
 
     def _judge_delay(self, turns: list[TurnFit]) -> None:
-        delay_s, sure = turns[0].delay_s, confidence_of(turns[0].cost, turns[2].cost)
+        delay_s, sure = turns[0].delay_s, confidence_of(turns[0], turns[2])
         if abs(delay_s) < _MIN_DELAY_S or sure < _SURE:
             return
         late = f"{abs(delay_s):.2f} s {'later' if delay_s > 0.0 else 'earlier'}"

@@ -40,6 +40,17 @@ class PingMotions:
     def __len__(self) -> int:
         return len(self.begin_s)
 
+    @property
+    def repeats(self) -> float:
+        """How many motions tell of the same moment, at least 1."""
+        if not len(self):
+            return 1.0
+        covered_s, until_s = 0.0, -np.inf
+        for begin_s, end_s in zip(self.begin_s, self.end_s, strict=True):
+            covered_s += max(0.0, float(end_s - max(begin_s, until_s)))
+            until_s = max(until_s, float(end_s))
+        return max(1.0, float((self.end_s - self.begin_s).sum()) / covered_s)
+
     def covariance(self, free_sigma: tuple[float, float, float] = (3.0, 3.0, 0.5)) -> FloatArray:
         """Covariances (M, 3, 3); a free direction has `free_sigma` [m, m, rad]."""
         weak = np.diag(1.0 / np.square(free_sigma))
