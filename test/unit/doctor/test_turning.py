@@ -8,6 +8,7 @@ import pytest
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, NavigationSample
+from uw_dslam_ros2.core.doctor.kernels import mean_nearness
 from uw_dslam_ros2.core.doctor.turning import BeamSample
 from uw_dslam_ros2.core.doctor.turning_verdict import choose_spans, examine_turning
 from uw_dslam_ros2.core.se2 import SE2
@@ -135,3 +136,36 @@ def test_a_delay_that_the_imu_shows_by_itself_is_told_once():
     found = Examination(conventions=Conventions(imu_delay_s=0.8))
     examine_turning(found, navigation, beams, choose_spans(navigation, beams.stamp_s))
     assert found.findings == []
+
+
+def test_a_velocity_that_is_silent_for_a_while_spoils_nothing():
+    turning = replace(TURN, zero_rad=math.radians(94.0), is_clockwise=True)
+    navigation, beams = recording(1, turning, delay_s=0.8)
+    at_s = navigation.velocity_s
+    is_heard = np.ones(len(at_s), bool)
+    for begin_s in range(60, 660, 120):
+        is_heard &= (at_s < begin_s) | (at_s > begin_s + 12.0)
+    navigation = replace(
+        navigation,
+        velocity_s=at_s[is_heard],
+        velocity_m_s=navigation.velocity_m_s[is_heard],
+    )
+    conventions = examined(navigation, beams).conventions
+    assert conventions.sonar_is_mirrored
+    assert conventions.sonar_yaw_offset_rad == pytest.approx(turning.zero_rad, abs=0.05)
+    assert conventions.imu_delay_s == pytest.approx(0.8, abs=0.2)
+
+
+def test_nearness_is_that_of_all_pairs_of_one_stretch_that_are_apart(rng):
+    stamp_s, stretch = np.sort(rng.uniform(0.0, 20.0, 60)), np.repeat([0, 1, 2], 20)
+    x, y = rng.normal(size=(2, 60))
+    near = []
+    for i in range(0, 60, 3):
+        for j in range(i + 1, 60):
+            if stretch[i] == stretch[j] and stamp_s[j] - stamp_s[i] > 2.0:
+                squares = ((x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2) / 0.7**2
+                near.append((1.0 + squares) ** -2)
+    mean, count = mean_nearness(stamp_s, stretch, x, y, 2.0, 0.7, 3)
+    assert count == len(near)
+    assert mean == pytest.approx(np.mean(near))
+    assert mean_nearness(stamp_s, stretch, x, y, 30.0, 0.7, 1) == (0.0, 0)

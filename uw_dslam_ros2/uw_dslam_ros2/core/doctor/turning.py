@@ -16,6 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.fits import at_times
+from uw_dslam_ros2.core.doctor.kernels import mean_nearness
 from uw_dslam_ros2.core.doctor.sample import NavigationSample
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.se2 import SE2
@@ -25,17 +26,20 @@ __all__ = ["BeamSample", "TurningFit", "TurningReading", "TurningTrial", "choose
 FloatArray = NDArray[np.float64]
 
 _WINDOW_S = 75.0
-_NUM_WINDOWS = 16
+_NUM_WINDOWS = 32
 _MIN_WINDOWS = 4
 _MIN_WAY_M = 4.0
 """A vehicle that moves less in a window sees the same, wherever the sonar's zero is."""
-_MIN_POINTS, _MAX_POINTS = 60, 350
+_MIN_POINTS, _MAX_POINTS = 60, 1000
+_MIN_PAIRS = 1000
 _MIN_APART_S = 4.0
 """Echoes nearer in time are of one turn: that they lie side by side says nothing."""
+_MAX_SILENCE_S = 5.0
+"""Where the vehicle went while its velocity was missing for longer, nobody knows."""
 _STEP_S = 0.1
 _COARSE_M, _MIDDLE_M, _FINE_M = 2.0, 0.8, 0.4
 _COARSE_STEP = 5
-"""Where the kernel is wide, every fifth pair says the same."""
+"""Where the kernel is wide, a fifth of the pairs says the same."""
 _MAX_DELAY_S = 2.0
 _CLIMB = (
     (_COARSE_M, math.radians(5.0), 0.5),
@@ -124,36 +128,41 @@ class _Window:
         navigation: NavigationSample,
         yaw_rad: FloatArray,
     ) -> None:
-        inside = inside[:: -(-len(inside) // _MAX_POINTS)]
+        # The way over a silence is guessed: what was heard before and after it is not compared.
+        heard_s = navigation.velocity_s
+        silences = np.flatnonzero(np.diff(heard_s) > _MAX_SILENCE_S)
+        begun = np.searchsorted(heard_s[silences], beams.stamp_s[inside])
+        ended = np.searchsorted(heard_s[silences + 1], beams.stamp_s[inside])
+        inside, stretch = inside[begun == ended], ended[begun == ended]
+        few = slice(None, None, max(1, -(-len(inside) // _MAX_POINTS)))
+        inside, self._stretch = inside[few], stretch[few]
         self._stamp_s = beams.stamp_s[inside]
         self._bearing, self._range_m = beams.bearing_rad[inside], beams.range_m[inside]
         self._mount = beams.T_base_sonar
         self._imu_s, self._yaw = navigation.imu_s, yaw_rad
         lead_s = _MAX_DELAY_S + 1.0
-        self._grid = np.arange(self._stamp_s[0] - lead_s, self._stamp_s[-1] + lead_s, _STEP_S)
+        first_s, last_s = (self._stamp_s[0], self._stamp_s[-1]) if len(inside) else (0.0, 0.0)
+        self._grid = np.arange(first_s - lead_s, last_s + lead_s, _STEP_S)
         velocity = navigation.velocity_m_s
         self._velocity = sum(
             unit * _held(self._grid, navigation.velocity_s, velocity[:, i])
             for i, unit in enumerate((1.0, 1j))
         )
         self._lever = complex(*navigation.velocity_lever_m)
-        first, second = np.triu_indices(len(inside), 1)
-        apart = self._stamp_s[second] - self._stamp_s[first] > _MIN_APART_S
-        self._first, self._second = first[apart], second[apart]
 
     @property
     def is_usable(self) -> bool:
         """Whether the vehicle moved, its velocity and heading are known, and pairs are many."""
+        if len(self._stamp_s) < _MIN_POINTS:
+            return False
         yaw = at_times(self._grid, self._imu_s, self._yaw)
+        _, num_pairs = self._nearness(np.zeros(len(self._stamp_s), np.complex128), _FINE_M)
         way_m = float(np.abs(self._velocity).sum()) * _STEP_S  # NaN where a gap is
         return (
-            len(self._stamp_s) >= _MIN_POINTS
-            and len(self._first) >= _MIN_POINTS
-            and way_m > _MIN_WAY_M
-            and bool(np.isfinite(yaw).mean() > 0.9)
+            num_pairs >= _MIN_PAIRS and way_m > _MIN_WAY_M and bool(np.isfinite(yaw).mean() > 0.9)
         )
 
-    def points(self, reading: TurningReading) -> FloatArray:
+    def points(self, reading: TurningReading) -> NDArray[np.complex128]:
         """Echoes (N,) as x + iy where they lie by this reading."""
         yaw = reading.heading * np.interp(self._grid + reading.delay_s, self._imu_s, self._yaw)
         direction = np.exp(1j * yaw)
@@ -169,11 +178,12 @@ class _Window:
 
     def score(self, reading: TurningReading, width_m: float) -> float:
         """Mean nearness of echoes that were heard at different times, 0 to 1."""
-        points = self.points(reading)
-        few = slice(None, None, _COARSE_STEP if width_m >= _COARSE_M else 1)
-        offset = points[self._first[few]] - points[self._second[few]]
-        squares = (np.square(offset.real) + np.square(offset.imag)) / width_m**2
-        return float(np.mean(1.0 / np.square(1.0 + squares)))
+        return self._nearness(self.points(reading), width_m)[0]
+
+    def _nearness(self, points: NDArray[np.complex128], width_m: float) -> tuple[float, int]:
+        step = _COARSE_STEP if width_m >= _COARSE_M else 1
+        real, imag = points.real.copy(), points.imag.copy()
+        return mean_nearness(self._stamp_s, self._stretch, real, imag, _MIN_APART_S, width_m, step)
 
 
 def _held(grid: FloatArray, known_s: FloatArray, known: FloatArray) -> FloatArray:
