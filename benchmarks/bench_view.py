@@ -19,7 +19,6 @@ from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapG
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.view.queue_source import register_by_engine
 from uw_dslam_ros2.view.server import ViewServer
 from uw_dslam_ros2.view.showing import Showing
 
@@ -110,10 +109,6 @@ class Moving:
     def status(self) -> dict[str, object]:
         """Nothing else."""
         return {"is_live": True, "notes": []}
-
-    def register(self):  # type: ignore[no-untyped-def]
-        """Not asked here."""
-        return register_by_engine
 
     def listen(self, on_change) -> None:  # type: ignore[no-untyped-def]
         """Pages are told by the benchmark."""

@@ -12,7 +12,7 @@ import types
 import pytest
 from unit.cli import missions
 
-from uw_dslam_ros2.view import queue_source
+from uw_dslam_ros2.view import registering
 from uw_dslam_ros2.view.queue_source import QueueSource
 from uw_dslam_ros2.view.server import ViewServer
 
@@ -184,7 +184,7 @@ def deciding(browser, monkeypatch):
             return dataclasses.replace(answer, verdict=missions.Verdict.IMPROBABLE)
         return dataclasses.replace(answer, T_target_source=prior.T_target_source)
 
-    monkeypatch.setattr(queue_source, "register_by_engine", known)
+    monkeypatch.setattr(registering, "register_by_engine", known)
 
     @contextlib.contextmanager
     def run(size):

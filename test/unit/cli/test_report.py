@@ -24,6 +24,7 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps import read_map, write_map
 from uw_dslam_ros2.io.trajectories import write_tum
+from uw_dslam_ros2.view.queue_source import QueueSource
 
 FACTS = RunFacts(
     "A <title>", ["bag_1"], "offline", {"queue": {"mode": "graph"}}, {"mission": 3}, {}
@@ -257,3 +258,19 @@ def test_what_people_decided_is_listed_with_who_and_when_and_drawn(tmp_path: Pat
 
 def test_a_report_without_decisions_does_not_speak_of_them(folder: Path) -> None:
     assert "Decided by people" not in (folder / "report.html").read_text()
+
+
+def test_matches_are_shown_as_the_view_shows_them(folder: Path) -> None:
+    queue = missions.settled_queue()
+    showing = QueueSource("", queue).showing()
+    looks = dict(outcome_of(queue).looks)
+    rows = outcome_of(queue).registrations
+    assert rows[min(looks) - 1].is_used
+    # The one that holds first, and of the runs that are apart the best guess.
+    assert [rows[number - 1].is_used for number in looks] == [True, False, False]
+    html = (folder / "report.html").read_text()
+    assert "Matches, looked into" in html
+    assert html.count("not used: the best guess") == 2
+    for number, look in looks.items():
+        png = (folder / f"match_{number}.png").read_bytes()
+        assert png == look.picture("agreement") == showing.pair(number).picture("agreement")

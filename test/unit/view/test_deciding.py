@@ -21,7 +21,7 @@ from uw_dslam_ros2.core.merging import Decision, DecisionKind, MapQueue
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.session import Session, SessionInUseError, load_session, save_session
-from uw_dslam_ros2.view import queue_source
+from uw_dslam_ros2.view import registering
 from uw_dslam_ros2.view.export import export_zip
 from uw_dslam_ros2.view.laying import lay_out, run_map
 from uw_dslam_ros2.view.queue_source import QueueSource
@@ -38,7 +38,7 @@ def _quick_answers(monkeypatch):
     def refuse(*_):
         return missions.RegistrationResult.refused(missions.Verdict.IMPROBABLE, "not here")
 
-    monkeypatch.setattr(queue_source, "register_by_engine", refuse)
+    monkeypatch.setattr(registering, "register_by_engine", refuse)
 
 
 @pytest.fixture

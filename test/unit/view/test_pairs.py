@@ -1,12 +1,14 @@
 """Two maps laid on each other: cells come where the motion says, colours say what agrees."""
 
+from importlib import resources
+
 import cv2
 import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.view.pairs import lay_on
+from uw_dslam_ros2.view.pairs import KEY, lay_on
 
 
 def blocks(rng, spec):
@@ -54,3 +56,9 @@ def test_colours_tell_agreement_from_conflict():
     assert colours["target"] == colours["source"] == (0, 78, 56)
     assert colours["conflict"] == (204, 40, 0)
     assert colours["alone"] == (230, 159, 0)
+
+
+def test_the_page_explains_the_colours_as_reports_do():
+    script = (resources.files("uw_dslam_ros2.view") / "static" / "pair.js").read_text()
+    for name, colour in KEY.items():
+        assert f'["#{bytes(colour[:3]).hex()}", "{name}"]' in script

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.decision_rows import DecisionRow
+from uw_dslam_ros2.cli.looks import looks_of
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import (
     Constraint,
@@ -35,6 +36,7 @@ from uw_dslam_ros2.io.maps import write_map
 from uw_dslam_ros2.io.pose_graphs import pose_graph_bytes
 from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.trajectories import write_tum
+from uw_dslam_ros2.view.pairs import Pair
 
 __all__ = ["Outcome", "RegistrationRow", "VehicleOutcome", "outcome_of", "write_outcome"]
 
@@ -158,6 +160,8 @@ class Outcome:
     unmapped: tuple[str, ...] = ()
     """Vehicles of which there is no map at all."""
     georeference: Georeference | None = None
+    looks: tuple[tuple[int, Pair], ...] = ()
+    """Of a few registrations, by number: both maps laid on each other."""
 
     @property
     def names(self) -> RunNames:
@@ -239,6 +243,7 @@ def outcome_of(queue: MapQueue) -> Outcome:
         tuple(queue.loops()),
         tuple(DecisionRow.of(record, names) for record in queue.decisions()),
         georeference=queue.georeference(),
+        looks=looks_of(queue.answers(), records),
     )
 
 

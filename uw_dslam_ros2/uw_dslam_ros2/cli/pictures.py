@@ -46,10 +46,11 @@ from uw_dslam_ros2.cli.map_drawing import (
 )
 from uw_dslam_ros2.cli.outcome import Outcome
 from uw_dslam_ros2.cli.scoring import Scores, Truth
-from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import ConstraintKind, SubmapState
 from uw_dslam_ros2.core.metrics import interpolate_poses, resample
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.view.pairs import KEY, lay_on
 
 __all__ = [
     "before_after",
@@ -301,30 +302,24 @@ def error_plot(outcome: Outcome, truth: Truth, scores: Scores) -> Figure | None:
 def overlay(
     source: OccupancyMap, target: OccupancyMap, T_target_source: SE2, title: str
 ) -> Figure:
-    """Lay a source map on a target map: their walls in two colours, and where both agree."""
-    spec = common_spec(target, source, T_target_source)
-    found, true = resample(source, spec, T_target_source), resample(target, spec)
-    picture = np.empty((*spec.shape, 3), dtype=np.uint8)
-    picture[:] = to_bytes(UNKNOWN_COLOR)
-    picture[(found >= 0) ^ (true >= 0)] = to_bytes(SEEN_COLOR)
-    picture[(found >= 0) & (true >= 0)] = to_bytes(FREE_COLOR)
-    tolerance_cells = 2.0
-    both = (true > 50) & near_walls(found > 50, tolerance_cells)
-    both |= (found > 50) & near_walls(true > 50, tolerance_cells)
-    picture[true > 50] = to_bytes(MISSING_COLOR)
-    picture[found > 50] = to_bytes(EXTRA_COLOR)
-    picture[both] = to_bytes(AGREE_COLOR)
+    """Lay a source map on a target map, as the view does: where walls agree, and where not."""
+    pair = lay_on(target, source, T_target_source)
+    known = (pair.target >= 0) | (pair.source >= 0)
+    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    low = np.array([rows[0], cols[0]]) if len(rows) else np.zeros(2, np.int64)
+    high = np.array([rows[-1], cols[-1]]) + 1 if len(rows) else np.array(pair.spec.shape)
+    resolution_m = pair.spec.resolution_m
+    corner = pair.spec.T_frame_grid @ SE2(low[1] * resolution_m, low[0] * resolution_m)
+    spec = GridSpec(resolution_m, int(high[0] - low[0]), int(high[1] - low[1]), corner)
+    rgba = pair.agreement()[low[0] : high[0], low[1] : high[1]]
+    picture = np.where(rgba[:, :, 3:] > 0, rgba[:, :, :3], to_bytes(UNKNOWN_COLOR))
     figure, axes = single_map(spec)
-    show_picture(axes, picture, spec)
+    show_picture(axes, picture.astype(np.uint8), spec)
     scale_bar(axes)
     set_title(axes, title)
-    legend_below(
-        axes,
-        [
-            Patch(color=EXTRA_COLOR, label="walls of the source"),
-            Patch(color=MISSING_COLOR, label="walls of the target"),
-            Patch(color=AGREE_COLOR, label="walls of both"),
-            Patch(facecolor=FREE_COLOR, edgecolor="#999999", label="seen by both"),
-        ],
-    )
+    patches = [
+        Patch(facecolor=np.array(colour[:3]) / 255.0, edgecolor="#999999", label=name)
+        for name, colour in KEY.items()
+    ]
+    legend_below(axes, patches)
     return figure

@@ -21,6 +21,7 @@ from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.provenance import contradictions_png
 from uw_dslam_ros2.io.wall_files import dxf_bytes, walls_geojson_bytes
+from uw_dslam_ros2.view.pairs import KEY
 
 __all__ = ["RunFacts", "headline", "whose_error", "write_report"]
 
@@ -190,7 +191,9 @@ def _draw(
         figures |= {} if errors is None else {"trajectory_error": errors}
     if facts.link:
         figures["link"] = known_over_time(facts.link)
-    return {name: pictures.png_bytes(figure) for name, figure in figures.items()}
+    images = {name: pictures.png_bytes(figure) for name, figure in figures.items()}
+    images |= {f"match_{number}": look.picture("agreement") for number, look in outcome.looks}
+    return images
 
 
 def render_html(
@@ -220,6 +223,7 @@ def render_html(
             name: "data:image/png;base64," + base64.b64encode(content).decode()
             for name, content in images.items()
         },
+        key={name: f"#{bytes(colour[:3]).hex()}" for name, colour in KEY.items()},
         meaning={verdict.name: text for verdict, text in _MEANING.items()},
         settings=sorted(_flat(facts.settings)),
     )

@@ -62,6 +62,7 @@ def _put_in_place(made: Path, folder: Path) -> None:
     files = sorted(path.relative_to(made) for path in made.rglob("*") if path.is_file())
     files.sort(key=lambda path: path.name.startswith("report."))
     stale = {path.relative_to(folder) for path in (folder / "trajectories").glob("*.tum")}
+    stale |= {path.relative_to(folder) for path in folder.glob("match_*.png")}
     stale |= {Path(name) for name in _OF_TRUTH}
     for path in files:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -10,11 +11,15 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
+from uw_dslam_ros2.core.merging.graph.answers import Query
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapGroup, render_group
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.view.tiles import png_bytes
 
-__all__ = ["PAIR_LAYERS", "Pair", "lay_on", "map_picture"]
+__all__ = ["KEY", "PAIR_LAYERS", "Pair", "lay_on", "map_picture", "pair_of", "rendered"]
 
 ByteArray = NDArray[np.uint8]
 
@@ -34,6 +39,15 @@ _COLOURS = {
 }
 
 
+KEY = {
+    "walls of both": _COLOURS["agree"],
+    "wall of one in free water of the other": _COLOURS["conflict"],
+    "walls of the target alone": _COLOURS["target"],
+    "walls of the source alone": _COLOURS["source"],
+}
+"""What the colours of agreement mean; the same in the view, the report and ``register``."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
     """Two maps on one lattice, int8 (R, C) each as in `OccupancyMap`; rows grow with y."""
@@ -45,12 +59,13 @@ class Pair:
     def picture(self, layer: str) -> bytes:
         """PNG of one layer, north up; see `PAIR_LAYERS`."""
         if layer == "agreement":
-            rgba = self._agreement()
+            rgba = self.agreement()
         else:
             return map_picture(self.target if layer == "target" else self.source, layer)
         return png_bytes(np.ascontiguousarray(rgba[::-1]))
 
-    def _agreement(self) -> ByteArray:
+    def agreement(self) -> ByteArray:
+        """(R, C, 4) red, green, blue, opacity: what agrees and what conflicts, see `KEY`."""
         walls = self.target >= _WALL_PERCENT, self.source >= _WALL_PERCENT
         maps = self.target, self.source
         rgba = np.zeros((*self.target.shape, 4), np.uint8)
@@ -86,6 +101,29 @@ def map_picture(values: NDArray[np.int8], layer: str, *, is_clear: bool = False)
         rgba[values >= 0, 3] = _CLEAR
     rgba[values >= _WALL_PERCENT] = _COLOURS[layer]
     return png_bytes(np.ascontiguousarray(rgba[::-1]))
+
+
+def pair_of(query: Query, T_target_source: SE2, submaps: Mapping[SubmapId, StoredSubmap]) -> Pair:
+    """Both maps of a question laid on each other.
+
+    Raises
+    ------
+    InvalidInputError
+        If a submap of it is missing, or a map is empty.
+    """
+    source, target = rendered(query.source, submaps), rendered(query.target, submaps)
+    return lay_on(target, source, T_target_source)
+
+
+def rendered(group: SubmapGroup, submaps: Mapping[SubmapId, StoredSubmap]) -> OccupancyMap:
+    """The map of a group; an error where its submaps are not here, or empty."""
+    missing = [str(submap_id) for submap_id in group.ids if submap_id not in submaps]
+    if missing:
+        raise InvalidInputError(f"the submaps {', '.join(missing)} are not here any more")
+    occupancy = render_group(group, submaps, LOG_ODDS_MAX)
+    if occupancy is None:
+        raise InvalidInputError("the map of this pair is empty")
+    return occupancy
 
 
 def lay_on(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> Pair:

@@ -11,14 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from uw_dslam_ros2.core.errors import DataError, UwDslamError
-from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import Decision, MapQueue
-from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
-from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
 from uw_dslam_ros2.io.session import Session
-from uw_dslam_ros2.view.showing import Register, Showing
+from uw_dslam_ros2.view import registering
+from uw_dslam_ros2.view.showing import Showing
 
-__all__ = ["QueueSource", "register_by_engine"]
+__all__ = ["QueueSource"]
 
 _WRITTEN_WITHIN_S = 30.0
 
@@ -68,10 +66,6 @@ class QueueSource:
         is_busy = self._worker is not None and self._worker.is_alive()
         notes = [self._doing] if is_busy else []
         return {"is_live": False, "notes": [*notes, *filter(None, [self._trouble])]}
-
-    def register(self) -> Register:
-        """The engine itself."""
-        return register_by_engine
 
     def listen(self, on_change: Callable[[], None]) -> None:
         """Have something called when the queue has changed."""
@@ -165,7 +159,9 @@ class QueueSource:
                 continue
             (request,) = requests
             try:
-                result = register_by_engine(request.source, request.target, request.prior)
+                result = registering.register_by_engine(
+                    request.source, request.target, request.prior
+                )
             except UwDslamError as error:
                 with self._lock:
                     self._queue.cancel_request(request.request_id)
@@ -187,10 +183,3 @@ class QueueSource:
             self._write(queue)
         except UwDslamError as error:
             self._trouble = str(error)
-
-
-def register_by_engine(
-    source: OccupancyMap, target: OccupancyMap, prior: PriorWindow | None
-) -> RegistrationResult:
-    """Register in this process, with the defaults."""
-    return register_grids(source, target, GridRegistrationConfig(), prior=prior)

@@ -25,7 +25,7 @@ from uw_dslam_ros2.view.export import export_zip
 from uw_dslam_ros2.view.laying import lay_out, run_map
 from uw_dslam_ros2.view.pace import Pace
 from uw_dslam_ros2.view.pairs import PAIR_LAYERS, Pair
-from uw_dslam_ros2.view.showing import Register, Showing
+from uw_dslam_ros2.view.showing import Showing
 
 __all__ = ["Source", "ViewServer", "is_loopback"]
 
@@ -59,9 +59,6 @@ class Source(Protocol):
 
     def status(self) -> dict[str, Any]:
         """What changes without the map changing: ages, diagnostics, bytes on the link."""
-
-    def register(self) -> Register:
-        """How a pair is registered once more."""
 
     def decide(self, decision: Decision) -> Decision:
         """Write down what a person decided; its number and time are given here.
@@ -347,7 +344,7 @@ class ViewServer:
         number, _ = _pair_of(request)
 
         def work() -> list[dict[str, Any]]:
-            result = self._source.showing().result(number, self._source.register())
+            result = self._source.showing().result(number)
             return [
                 {
                     "pose": rival.T_target_source.as_array().round(4).tolist(),
@@ -364,7 +361,7 @@ class ViewServer:
         if key not in self._pairs:
             while len(self._pairs) >= _MAX_PAIRS:
                 del self._pairs[next(iter(self._pairs))]
-            self._pairs[key] = showing.pair(number, rival, self._source.register())
+            self._pairs[key] = showing.pair(number, rival)
         return self._pairs[key]
 
     async def _in_thread(self, work: Callable[[], Any]) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,12 +19,12 @@ from uw_dslam_ros2.core.merging import (
     SubmapRecord,
     SubmapState,
 )
-from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.merging.graph.answers import Answer
-from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapGroup, render_group
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapGroup
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.view import registering
 from uw_dslam_ros2.view.drawn import Drawn
 from uw_dslam_ros2.view.overview import (
     Names,
@@ -36,14 +36,11 @@ from uw_dslam_ros2.view.overview import (
     track_piece,
     vehicle_rows,
 )
-from uw_dslam_ros2.view.pairs import Pair, lay_on
+from uw_dslam_ros2.view.pairs import Pair, pair_of, rendered
 
-__all__ = ["Register", "Showing"]
+__all__ = ["Showing"]
 
 FloatArray = NDArray[np.float64]
-
-Register = Callable[[OccupancyMap, OccupancyMap, Any], RegistrationResult]
-"""Source, target, prior or None: asks for one registration; used for rivals."""
 
 _GAP_SHARE = 0.08  # of the page's width, between groups that stand side by side
 
@@ -201,9 +198,7 @@ class Showing:
                 }
         return None
 
-    def pair(
-        self, number: int, rival: int | None = None, register: Register | None = None
-    ) -> Pair:
+    def pair(self, number: int, rival: int | None = None) -> Pair:
         """Both maps of an answer laid on each other, as the answer or one of its rivals says.
 
         Raises
@@ -213,8 +208,8 @@ class Showing:
         """
         answer = self.answer(number)
         motion = answer.T_target_source
-        if rival is not None and register is not None:
-            others = self.result(number, register).rivals
+        if rival is not None:
+            others = self.result(number).rivals
             if not 0 <= rival < len(others):
                 raise InvalidInputError(
                     f"rival is {rival}, registration {number} has {len(others)}"
@@ -222,14 +217,13 @@ class Showing:
             motion = others[rival].T_target_source
         if motion is None:
             raise InvalidInputError(f"registration {number} has no pose: {answer.why}")
-        source, target = self._pair_maps(answer)
-        return lay_on(target, source, motion)
+        return pair_of(answer.query, motion, self._stored)
 
-    def result(self, number: int, register: Register) -> RegistrationResult:
+    def result(self, number: int) -> RegistrationResult:
         """Register the pair of an answer once more, for what an answer does not keep: rivals."""
-        answer = self.answer(number)
-        source, target = self._pair_maps(answer)
-        return register(source, target, answer.query.prior)
+        query = self.answer(number).query
+        maps = self.rendered(query.source), self.rendered(query.target)
+        return registering.register_by_engine(*maps, query.prior)
 
     def stored(self, submap_id: SubmapId) -> StoredSubmap:
         """A submap that is shown."""
@@ -243,19 +237,9 @@ class Showing:
             )
         return self._answers[number - 1][0]
 
-    def _pair_maps(self, answer: Answer) -> tuple[OccupancyMap, OccupancyMap]:
-        source, target = self.rendered(answer.query.source), self.rendered(answer.query.target)
-        return source, target
-
     def rendered(self, group: SubmapGroup) -> OccupancyMap:
         """The map of a group; an error where its submaps are not here, or empty."""
-        missing = [self.names.submap(i) for i in group.ids if i not in self._stored]
-        if missing:
-            raise InvalidInputError(f"the submaps {', '.join(missing)} are not here any more")
-        occupancy = render_group(group, self._stored, LOG_ODDS_MAX)
-        if occupancy is None:
-            raise InvalidInputError("the map of this pair is empty")
-        return occupancy
+        return rendered(group, self._stored)
 
     def _submap_shown(self, record: SubmapRecord) -> _SubmapShown:
         """What the page has of a submap, as before where nothing changed: most of its bytes."""

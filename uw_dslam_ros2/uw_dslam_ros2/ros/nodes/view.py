@@ -32,9 +32,8 @@ from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown
 from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SERVICES
 from uw_dslam_ros2.ros.plumbing.running import run_node
 from uw_dslam_ros2.view.pace import Pace
-from uw_dslam_ros2.view.queue_source import register_by_engine
 from uw_dslam_ros2.view.server import ViewServer
-from uw_dslam_ros2.view.showing import Register, Showing
+from uw_dslam_ros2.view.showing import Showing
 
 __all__ = ["View", "main"]
 
@@ -124,10 +123,6 @@ class View(Node):
             "notes": notes,
             "diagnostics": self._board.rows(now_s),
         }
-
-    def register(self) -> Register:
-        """The engine itself: servers are there for the merge."""
-        return register_by_engine
 
     def listen(self, on_change: Callable[[], None]) -> None:
         """Have something called when the state has changed."""
