@@ -69,8 +69,8 @@ def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]
         Track(
             t.T_map_sonar,
             [p.points for p in t.pings],
-            drift_m=min(t.drift_m, DRIFT_M),
-            drift_rad=min(t.drift_rad, DRIFT_RAD),
+            drift_m=t.drift_m,
+            drift_rad=t.drift_rad,
         )
         for t in tracks
     ]

@@ -28,7 +28,7 @@ IntArray = NDArray[np.int64]
 _NODE_M = 2.0
 """A path bends at nodes this far apart."""
 DRIFT_M, DRIFT_RAD = 0.03, 0.003
-"""How far a path and its heading drift on one metre, at most; they grow with the way's root."""
+"""How far a path and its heading drift on one metre, where nobody says; with the way's root."""
 _WAY_SIGMA, _MOUNTING_SIGMA_RAD = 0.01, 0.01
 """Of the way, by a velocity log's scale; of the sonar's yaw on the vehicle."""
 _ANCHOR_SIGMA_M, _ANCHOR_SIGMA_RAD = 0.5, 0.02
