@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
@@ -17,7 +19,6 @@ from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapG
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.view.tiles import png_bytes
 
 __all__ = ["KEY", "PAIR_LAYERS", "Pair", "lay_on", "map_picture", "pair_of", "rendered"]
 
@@ -59,10 +60,8 @@ class Pair:
     def picture(self, layer: str) -> bytes:
         """PNG of one layer, north up; see `PAIR_LAYERS`."""
         if layer == "agreement":
-            rgba = self.agreement()
-        else:
-            return map_picture(self.target if layer == "target" else self.source, layer)
-        return png_bytes(np.ascontiguousarray(rgba[::-1]))
+            return _few_colours_png(self.agreement())
+        return map_picture(self.target if layer == "target" else self.source, layer)
 
     def agreement(self) -> ByteArray:
         """(R, C, 4) red, green, blue, opacity: what agrees and what conflicts, see `KEY`."""
@@ -100,7 +99,19 @@ def map_picture(values: NDArray[np.int8], layer: str, *, is_clear: bool = False)
     if is_clear:
         rgba[values >= 0, 3] = _CLEAR
     rgba[values >= _WALL_PERCENT] = _COLOURS[layer]
-    return png_bytes(np.ascontiguousarray(rgba[::-1]))
+    return _few_colours_png(rgba)
+
+
+def _few_colours_png(rgba: ByteArray) -> bytes:
+    """PNG with a palette, north up: a quarter of the size."""
+    packed = np.ascontiguousarray(rgba[::-1]).view(np.uint32)[:, :, 0]
+    colours, index = np.unique(packed, return_inverse=True)
+    table = colours.view(np.uint8).reshape(-1, 4)
+    picture = Image.fromarray(index.reshape(packed.shape).astype(np.uint8)).convert("P")
+    picture.putpalette(table[:, :3].tobytes())
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG", transparency=table[:, 3].tobytes(), optimize=True)
+    return buffer.getvalue()
 
 
 def pair_of(query: Query, T_target_source: SE2, submaps: Mapping[SubmapId, StoredSubmap]) -> Pair:
