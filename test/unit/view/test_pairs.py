@@ -56,6 +56,10 @@ def test_colours_tell_agreement_from_conflict():
     assert colours["target"] == colours["source"] == (0, 78, 56)
     assert colours["conflict"] == (204, 40, 0)
     assert colours["alone"] == (230, 159, 0)
+    small = cv2.imdecode(np.frombuffer(pair.picture("agreement", 7), np.uint8), -1)
+    assert max(small.shape[:2]) <= 7
+    shown = {tuple(colour) for colour in small[:, :, 2::-1].reshape(-1, 3).tolist()}
+    assert set(colours.values()) <= shown, "walls outlast what is smaller"
 
 
 def test_the_page_explains_the_colours_as_reports_do():

@@ -25,6 +25,7 @@ from uw_dslam_ros2.view.pairs import KEY
 
 __all__ = ["RunFacts", "headline", "whose_error", "write_report"]
 
+_LOOK_PIXELS = 420
 _MEANING = {
     Verdict.ACCEPTED: "the transform may be used",
     Verdict.TOO_FEW_FEATURES: "too little to match in one of the maps",
@@ -192,7 +193,8 @@ def _draw(
     if facts.link:
         figures["link"] = known_over_time(facts.link)
     images = {name: pictures.png_bytes(figure) for name, figure in figures.items()}
-    images |= {f"match_{number}": look.picture("agreement") for number, look in outcome.looks}
+    for index, look in outcome.looks:
+        images[f"match_{index}"] = look.picture("agreement", _LOOK_PIXELS)
     return images
 
 

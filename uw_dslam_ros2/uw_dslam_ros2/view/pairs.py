@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -57,27 +58,42 @@ class Pair:
     target: NDArray[np.int8]
     source: NDArray[np.int8]
 
-    def picture(self, layer: str) -> bytes:
-        """PNG of one layer, north up; see `PAIR_LAYERS`."""
-        if layer == "agreement":
-            return _few_colours_png(self.agreement())
-        return map_picture(self.target if layer == "target" else self.source, layer)
+    def picture(self, layer: str, max_side: int | None = None) -> bytes:
+        """PNG of one layer, north up; see `PAIR_LAYERS`.
 
-    def agreement(self) -> ByteArray:
+        With `max_side` that of agreement has no more pixels a side: walls outlast what is smaller.
+        """
+        if layer != "agreement":
+            return map_picture(self.target if layer == "target" else self.source, layer)
+        return _few_colours_png(self.agreement(max_side))
+
+    def agreement(self, max_side: int | None = None) -> ByteArray:
         """(R, C, 4) red, green, blue, opacity: what agrees and what conflicts, see `KEY`."""
         walls = self.target >= _WALL_PERCENT, self.source >= _WALL_PERCENT
         maps = self.target, self.source
-        rgba = np.zeros((*self.target.shape, 4), np.uint8)
-        rgba[(self.target >= 0) | (self.source >= 0)] = _COLOURS["free"]
+        # What tells more has a larger number.
+        names = ("", "free", "target", "source", "agree", "conflict")
+        shown = ((self.target >= 0) | (self.source >= 0)).astype(np.uint8)
         side = 2 * _REACH_CELLS + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         near = [cv2.dilate(wall.astype(np.uint8), kernel).astype(bool) for wall in walls]
         for own, other, name in ((0, 1, "target"), (1, 0, "source")):
-            rgba[walls[own]] = _COLOURS[name]
+            shown[walls[own]] = names.index(name)
             is_free = (maps[other] >= 0) & (maps[other] <= _FREE_PERCENT)
-            rgba[walls[own] & is_free & ~near[other]] = _COLOURS["conflict"]
-        rgba[(walls[0] & near[1]) | (walls[1] & near[0])] = _COLOURS["agree"]
-        return rgba
+            shown[walls[own] & is_free & ~near[other]] = names.index("conflict")
+        shown[(walls[0] & near[1]) | (walls[1] & near[0])] = names.index("agree")
+        if max_side is not None:
+            shown = _reduced(shown, math.ceil(max(shown.shape) / max_side))
+        table = np.array([(0, 0, 0, 0), *(_COLOURS[name] for name in names[1:])], np.uint8)
+        return table[shown]
+
+
+def _reduced(values: ByteArray, step: int) -> ByteArray:
+    """The largest of each square of cells."""
+    rows, cols = (-(-side // step) for side in values.shape)
+    even = np.zeros((rows * step, cols * step), np.uint8)
+    even[: values.shape[0], : values.shape[1]] = values
+    return np.asarray(even.reshape(rows, step, cols, step).max(axis=(1, 3)))
 
 
 def map_picture(values: NDArray[np.int8], layer: str, *, is_clear: bool = False) -> bytes:
