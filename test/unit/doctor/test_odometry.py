@@ -64,11 +64,10 @@ def test_a_mirrored_sonar_is_told_from_poses_in_ned(pings):
     assert (kinds[0], changes["sonar_is_mirrored"]) == ("sonar_mirrored", True)
 
 
-def test_without_a_height_it_cannot_be_told_which_is_the_wrong_way_round(pings):
-    for case in ((pings, in_ned(poses(0.0))), (mirrored(pings), poses(math.nan))):
-        kinds, changes = found(*case)
-        assert kinds == ["handedness"]
-        assert not changes
+def test_without_a_height_both_are_named_and_the_likelier_is_taken(pings):
+    assert found(pings, in_ned(poses(0.0))) == (["handedness"], {"odometry": "ned"})
+    kinds, changes = found(mirrored(pings), poses(math.nan))
+    assert (kinds[0], changes["odometry"]) == ("handedness", "ned")
 
 
 def test_the_sonars_clock_direction_and_scale_are_judged_by_the_poses(pings):

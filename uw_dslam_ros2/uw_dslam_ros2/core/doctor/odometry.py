@@ -111,8 +111,6 @@ class _Judge:
         if not is_alone:
             return
         self._judge_delay(turns)
-        if owner == "unknown":
-            return
         is_mirrored = owner == "sonar"
         side = np.array([1.0, sign if not is_mirrored else 1.0])
         fit = fit_velocity(
@@ -146,11 +144,12 @@ class _Judge:
         finding = Finding(kind, role, detail, confidence, vehicle_id=self._vehicle_id)
         self._result.add(finding, **changes)
 
-    def _say_mirrored(self, confidence: float) -> Literal["odometry", "sonar", "unknown"]:
+    def _say_mirrored(self, confidence: float) -> Literal["odometry", "sonar"]:
         """Tell whether the odometry or the sonar is the wrong way round.
 
         A mirrored path and a mirrored sonar make the same map but for a mirror, so that echoes do
         not tell: the frame's name does, or on which side of the surface it has the vehicle.
+        Without either the odometry is taken for NED, which is common, and the map may be mirrored.
         """
         is_z_down = self._odometry.is_z_down
         if self._odometry.is_named_ned:
@@ -175,11 +174,12 @@ class _Judge:
                 "handedness",
                 "odometry",
                 "the sonar's echoes turn against it: either it is north, east, down "
-                "(conventions.odometry: ned), or the sonar's port and starboard are exchanged "
-                "(conventions.sonar_is_mirrored: true)",
+                "(conventions.odometry: ned), which is the likelier, or the sonar's port and "
+                "starboard are exchanged (conventions.sonar_is_mirrored: true instead): then the "
+                "map is mirrored",
                 0.5,
+                odometry="ned",
             )
-            return "unknown"
         return "odometry"
 
     def _say_ned(
