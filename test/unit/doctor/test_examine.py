@@ -124,6 +124,15 @@ def test_nothing_is_said_where_nothing_is_wrong(recording):
     assert found.num_ping_motions > 40
 
 
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_wild_velocities_among_others_say_nothing_of_the_unit(recording, unit):
+    navigation, pings = recording
+    velocity = unit * navigation.velocity_m_s.copy()
+    velocity[::20] = unit * np.array([50.0, 20.0])
+    found = examine(replace(navigation, velocity_m_s=velocity), pings).conventions.changes()
+    assert found == ({} if unit == 1.0 else {"velocity_scale": 0.001})
+
+
 def test_without_a_dvl_the_imu_and_the_sonar_are_late_alike(recording):
     navigation, pings = late(imu_s=0.5)(*recording)
     alone = replace(

@@ -12,12 +12,13 @@ from uw_dslam_ros2.core.doctor.imu import ImuState
 from uw_dslam_ros2.core.doctor.sample import NavigationSample
 from uw_dslam_ros2.core.findings import Finding
 
-__all__ = ["judge_imu", "without_zeros"]
+__all__ = ["judge_imu", "without_spikes", "without_zeros"]
 
 _SWING_RAD = math.radians(8.6)
 _ZEROS_IN_A_ROW = 3
 _MOVES_M_S = 0.15
 _MIN_VELOCITIES = 20
+_SPIKE = 3.0
 _LEAST_DISTINCT = 0.05  # of measured velocities; of commanded ones a few in a thousand are
 
 
@@ -126,6 +127,19 @@ def without_zeros(
     )
     return replace(
         navigation, velocity_s=navigation.velocity_s[~is_zero], velocity_m_s=velocity[~is_zero]
+    )
+
+
+def without_spikes(navigation: NavigationSample) -> NavigationSample:
+    """Drop velocities that are far from all others: the mapper's filter refuses them as well."""
+    speed = np.hypot(*navigation.velocity_m_s.T)
+    if len(speed) < _MIN_VELOCITIES:
+        return navigation
+    is_spike = speed > _SPIKE * np.quantile(speed, 0.9)
+    return replace(
+        navigation,
+        velocity_s=navigation.velocity_s[~is_spike],
+        velocity_m_s=navigation.velocity_m_s[~is_spike],
     )
 
 

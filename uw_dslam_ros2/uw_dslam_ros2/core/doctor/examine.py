@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.alone import judge_imu, without_zeros
+from uw_dslam_ros2.core.doctor.alone import judge_imu, without_spikes, without_zeros
 from uw_dslam_ros2.core.doctor.delays import Delays, find_delays
 from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.fits import (
@@ -72,7 +72,7 @@ def examine(
         return result
     imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
     judge_imu(result, imu, vehicle_id)
-    navigation = without_zeros(result, navigation, vehicle_id)
+    navigation = without_spikes(without_zeros(result, navigation, vehicle_id))
     if len(motions) >= _MIN_MOTIONS:
         _Trial(result, navigation, imu, motions, pings, vehicle_id).run()
     return result
