@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.link import Layer, LayeredSubmap, encode_submap, read_outline
-from uw_dslam_ros2.core.link.coding.cells import with_walls
+from uw_dslam_ros2.core.link.coding.cells import blocks_of_known, seen_free, with_walls
 from uw_dslam_ros2.core.metrics import interpolate_poses, resample
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -93,13 +93,22 @@ def test_a_finer_layer_needs_the_one_below():
 
 
 def test_walls_told_exactly_leave_free_space_on_the_side_that_was_seen():
-    # Known before: free, then a wall two cells thick, then nothing.
-    known = np.array([[1, 1, 2, 2, 0]] * 3, np.int8)
-    walls = np.zeros((3, 5), bool)
+    # Known before: free, a wall three cells thick, nothing. Next to a wall nothing is told.
+    known = np.array([[1, 1, 2, 2, 2, 0, 0]] * 3, np.int8)
+    walls = np.zeros((3, 7), bool)
     walls[:, 2] = True
-    np.testing.assert_array_equal(with_walls(known, walls), [[1, 1, 2, 0, 0]] * 3)
-    walls = np.roll(walls, 1, axis=1)
-    np.testing.assert_array_equal(with_walls(known, walls), [[1, 1, 1, 2, 0]] * 3)
+    np.testing.assert_array_equal(with_walls(known, walls), [[1, 0, 2, 0, 0, 0, 0]] * 3)
+    walls = np.roll(walls, 2, axis=1)
+    np.testing.assert_array_equal(with_walls(known, walls), [[1, 1, 1, 0, 2, 0, 0]] * 3)
+
+
+def test_free_water_is_told_where_whole_blocks_are_known_and_not_behind_walls():
+    cells = np.zeros((12, 12), np.int8)
+    cells[1:12, 0:12] = 1
+    np.testing.assert_array_equal(blocks_of_known(cells)[:, 2], [False, *[True] * 5])
+    free = np.ones((9, 9), bool)
+    free[:, 6] = False  # a wall; behind it a strip of two cells
+    np.testing.assert_array_equal(seen_free(free)[4], [*[True] * 6, *[False] * 3])
 
 
 def test_finer_layers_show_the_walls_that_the_map_has():

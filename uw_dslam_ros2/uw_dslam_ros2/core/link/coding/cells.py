@@ -104,10 +104,13 @@ def drop_specks(cells: CellArray) -> CellArray:
 
 
 def blocks_of_known(cells: CellArray) -> NDArray[np.bool_]:
-    """Which blocks of 2 x 2 cells (R, C), R and C even, are known, by most of them and around."""
+    """Which blocks of 2 x 2 cells (R, C), R and C even, are known whole, as most around them.
+
+    What is called free and is not would contradict another map's walls.
+    """
     rows, cols = cells.shape
-    count = (cells != CELL_UNKNOWN).reshape(rows // 2, 2, cols // 2, 2).sum(axis=(1, 3))
-    return cv2.medianBlur((count >= 2).astype(np.uint8), 3) > 0
+    is_known = (cells != CELL_UNKNOWN).reshape(rows // 2, 2, cols // 2, 2).all(axis=(1, 3))
+    return cv2.medianBlur(is_known.astype(np.uint8), 3) > 0
 
 
 def seen_free(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -115,7 +118,13 @@ def seen_free(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
     Where what is free is told in large blocks, these are the far sides of walls.
     """
-    wide = cv2.morphologyEx(free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    wide = cv2.morphologyEx(
+        free.astype(np.uint8),
+        cv2.MORPH_OPEN,
+        np.ones((3, 3), np.uint8),
+        borderType=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
     # The corners of staircases come back.
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return (cv2.dilate(wide, cross) > 0) & free
@@ -133,19 +142,16 @@ def with_walls(known: CellArray, walls: NDArray[np.bool_]) -> CellArray:
     """Cells whose walls are told exactly; the rest is as it was `known` before, coarsely.
 
     Of what was a wall and is none any more, that is free which free cells beside it reach; the far
-    side of the wall is unknown.
+    side of the wall is unknown. So are the cells next to a wall, as on a mapper's own map.
     """
     is_bare = (known == CELL_WALL) & ~walls
-    free = (known == CELL_FREE) & ~walls
+    free = ((known == CELL_FREE) & ~walls).astype(np.uint8)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     for _ in range(_MAX_BARE_CELLS):
-        beside = np.zeros_like(free)
-        beside[1:] |= free[:-1]
-        beside[:-1] |= free[1:]
-        beside[:, 1:] |= free[:, :-1]
-        beside[:, :-1] |= free[:, 1:]
-        free |= beside & is_bare
+        free |= cv2.dilate(free, cross) & is_bare
+    beside = cv2.dilate(walls.astype(np.uint8), np.ones((3, 3), np.uint8))
     cells = np.full(known.shape, CELL_UNKNOWN, np.int8)
-    cells[free] = CELL_FREE
+    cells[free > beside] = CELL_FREE
     cells[walls] = CELL_WALL
     return cells
 
