@@ -15,6 +15,7 @@ from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.link import Layer
 from uw_dslam_ros2.core.link.transport.packets import Packet
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io.link_state import load_link_state
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_to_msg
 from uw_dslam_ros2.ros.nodes.acoustic_link import AcousticLinkNode
 from uw_dslam_ros2.ros.nodes.channel import ChannelNode
@@ -176,7 +177,7 @@ def test_a_killed_link_has_all_that_it_received_and_asks_for_nothing_again(
         send(room_submap("auv_1", 0))
         until(lambda: got[2] and got[2]["auv_1", 0].revision == Layer.FINE, "the submap")
         before = fleet.links[1]._link.to_state()
-        until(lambda: fleet.links[1]._is_changed is False, "what was received on the disk")
+        until(lambda: load_link_state(state).received == before.received, "it on the disk")
     again = make_link(ros_context, 2, state=state)
     with spinning(again):
         assert [s.submap_id for s in again._link.submaps()] == [("auv_1", 0, 0)]

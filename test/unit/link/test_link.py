@@ -169,6 +169,21 @@ def test_a_restarted_link_has_lost_nothing_and_sends_nothing_again():
     assert sum(link.counts.repairs for link in talk.links.values()) <= 6
 
 
+def test_a_restarted_link_has_parts_of_what_was_coming():
+    talk = Talk(num=2)
+    talk.add(own_submap(1, 0))
+    while not talk.links[2].to_state().received.get(1) or not (
+        parts := talk.links[2].to_state().received[1].fragments
+    ):
+        talk.run(talk.now_s + 0.5)
+    new = AcousticLink.from_state(LinkConfig(number=2), "auv_2", talk.links[2].to_state())
+    assert new.to_state().received[1].fragments == parts
+    talk.links[2] = new
+    talk.until_all_know(1, 100.0)
+    assert talk.links[1].counts.repairs == 0
+    assert new.counts.duplicates == 0
+
+
 def test_a_link_that_forgot_everything_begins_a_new_epoch():
     talk = fleet()
     talk.until_all_know(6, 200.0)

@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 
 from uw_dslam_ros2.core.errors import DataError
-from uw_dslam_ros2.core.link import LinkState
+from uw_dslam_ros2.core.link import LinkState, ReceivedState
 from uw_dslam_ros2.io.atomic import write_files
 
 __all__ = ["load_link_state", "save_link_state"]
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 def save_link_state(path: str | Path, state: LinkState) -> None:
@@ -22,8 +22,12 @@ def save_link_state(path: str | Path, state: LinkState) -> None:
         "epoch": state.epoch,
         "own": [[content.hex(), *rest] for content, *rest in state.own],
         "received": {
-            str(sender): [epoch, [[number, item.hex()] for number, item in items]]
-            for sender, (epoch, items) in state.received.items()
+            str(sender): {
+                "epoch": received.epoch,
+                "items": [[number, item.hex()] for number, item in received.items],
+                "fragments": [[*name, data.hex()] for *name, data in received.fragments],
+            }
+            for sender, received in state.received.items()
         },
     }
     text = json.dumps(content, separators=(",", ":"))
@@ -45,7 +49,9 @@ def load_link_state(path: str | Path) -> LinkState | None:
         )
     content = json.loads(text)
     if content["format"] != _FORMAT:
-        raise DataError(f"{path} has format {content['format']}, expected {_FORMAT}")
+        raise DataError(
+            f"{path} has format {content['format']}, expected {_FORMAT}; remove it to begin anew"
+        )
     return LinkState(
         content["epoch"],
         tuple(
@@ -53,8 +59,15 @@ def load_link_state(path: str | Path) -> LinkState | None:
             for item, rank, label, parts, num_sent, is_void in content["own"]
         ),
         {
-            int(sender): (epoch, tuple((number, bytes.fromhex(item)) for number, item in items))
-            for sender, (epoch, items) in content["received"].items()
+            int(sender): ReceivedState(
+                received["epoch"],
+                tuple((number, bytes.fromhex(item)) for number, item in received["items"]),
+                tuple(
+                    (number, needed, index, bytes.fromhex(data))
+                    for number, needed, index, data in received["fragments"]
+                ),
+            )
+            for sender, received in content["received"].items()
         },
     )
 

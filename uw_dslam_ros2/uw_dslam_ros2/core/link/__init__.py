@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.link.coding.codec import (
 from uw_dslam_ros2.core.link.coding.items import LayerKey
 from uw_dslam_ros2.core.link.coding.outline import Outline
 from uw_dslam_ros2.core.link.link import AcousticLink
-from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState
+from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState, ReceivedState
 
 __all__ = [
     "CODEC_VERSION",
@@ -24,6 +24,7 @@ __all__ = [
     "LinkCounts",
     "LinkState",
     "Outline",
+    "ReceivedState",
     "encode_submap",
     "read_outline",
 ]

@@ -33,7 +33,7 @@ from uw_dslam_ros2.core.link.coding.items import (
 from uw_dslam_ros2.core.link.transport.inbox import Inbox
 from uw_dslam_ros2.core.link.transport.outbox import Outbox, OutItem
 from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES, Packet, bundled, unbundled
-from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState
+from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState, ReceivedState
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = ["AcousticLink"]
@@ -400,7 +400,9 @@ class AcousticLink:
                 for i in self._outbox.items
             ),
             {
-                sender: (inbox.epoch, tuple(sorted(self._items[sender].items())))
+                sender: ReceivedState(
+                    inbox.epoch, tuple(sorted(self._items[sender].items())), inbox.fragments()
+                )
                 for sender, inbox in self._inboxes.items()
             },
         )
@@ -418,12 +420,13 @@ class AcousticLink:
                 key, data = read_layer(body)
                 link._own[key] = item
                 link._take_layer(config.number, key, data)
-        for sender, (epoch, items) in state.received.items():
-            inbox = link._inboxes[sender] = Inbox(epoch)
-            link._items[sender] = dict(items)
-            for number, item_content in items:
+        for sender, received in state.received.items():
+            inbox = link._inboxes[sender] = Inbox(received.epoch)
+            link._items[sender] = dict(received.items)
+            for number, item_content in received.items:
                 link._take_item(sender, item_content)
                 inbox.finish(number)
+            inbox.put_back(received.fragments)
         return link
 
     def submaps(self) -> Iterator[Submap]:

@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.link.transport.packets import (
     MIN_PACKET_BYTES,
 )
 
-__all__ = ["LinkConfig", "LinkCounts", "LinkState"]
+__all__ = ["LinkConfig", "LinkCounts", "LinkState", "ReceivedState"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +59,22 @@ class LinkCounts:
 
 
 @dataclass(frozen=True, slots=True)
+class ReceivedState:
+    """What has come of one sender."""
+
+    epoch: int
+    items: tuple[tuple[int, bytes], ...]
+    """Numbers and content."""
+    fragments: tuple[tuple[int, int, int, bytes], ...]
+    """Of items that are not complete: number, parts needed, index and content of each fragment."""
+
+
+@dataclass(frozen=True, slots=True)
 class LinkState:
     """What must outlive a restart."""
 
     epoch: int
     own: tuple[tuple[bytes, float, str, int, int, bool], ...]
     """Content, rank, label, parts, fragments sent, and whether it is void, of each item."""
-    received: dict[int, tuple[int, tuple[tuple[int, bytes], ...]]]
-    """Of each sender: its epoch, and numbers and content of what has come."""
+    received: dict[int, ReceivedState]
+    """Of each sender."""

@@ -16,7 +16,7 @@ from std_msgs.msg import Empty, UInt8MultiArray
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
-from uw_dslam_ros2.core.link import AcousticLink, LinkConfig
+from uw_dslam_ros2.core.link import AcousticLink, LinkConfig, LinkState
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.link_state import load_link_state, save_link_state
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_id_of, submap_to_msg
@@ -48,7 +48,8 @@ class AcousticLinkNode(Node):
             )
         self._lock = threading.Lock()
         self._outputs: dict[str, Publisher] = {}
-        self._is_changed, self._problem = False, ""
+        self._saved: LinkState | None = None
+        self._problem = ""
         self._link = self._resumed(link_config)
         # Callbacks are short, and the link is one thing: one after the other.
         group = MutuallyExclusiveCallbackGroup()
@@ -139,7 +140,7 @@ class AcousticLinkNode(Node):
     def _on_packet(self, msg: UInt8MultiArray) -> None:
         with self._lock:
             found = self._link.receive(bytes(msg.data), self._now_s())
-        self._is_changed = True
+        self._save()  # before a report says that it is here
         self._give(found)
         self._give_answers()
 
@@ -154,13 +155,13 @@ class AcousticLinkNode(Node):
         with self._lock:
             packet = self._link.next_packet(self._now_s())
         if packet is not None:
+            self._save()  # or its number could mean something else after a restart
             self._modem.publish(UInt8MultiArray(data=packet))
 
     # --- out ---------------------------------------------------------------------------------
 
     def _give(self, submaps: Any) -> None:
         for submap in submaps:
-            self._is_changed = True
             self._output_of(submap).publish(submap_to_msg(submap))
 
     def _give_answers(self) -> None:
@@ -177,13 +178,15 @@ class AcousticLinkNode(Node):
         return self._outputs[topic]
 
     def _save(self) -> None:
-        if not (self._config.state and self._is_changed):
+        if not self._config.state:
             return
         with self._lock:
             state = self._link.to_state()
+        if state == self._saved:
+            return
         try:
             save_link_state(self._config.state, state)
-            self._is_changed, self._problem = False, ""
+            self._saved, self._problem = state, ""
         except DataError as error:
             self._complain(str(error))
 

@@ -109,6 +109,20 @@ class Inbox:
             self._done.discard(self._base)
             self._base += 1
 
+    def fragments(self) -> tuple[tuple[int, int, int, bytes], ...]:
+        """Of items that are not complete: number, parts needed, index and content of each."""
+        return tuple(
+            (number, held.num_needed, index, payload)
+            for number, held in sorted(self._open.items())
+            for index, payload in sorted(held.fragments.items())
+        )
+
+    def put_back(self, fragments: tuple[tuple[int, int, int, bytes], ...]) -> None:
+        """Undo `fragments`."""
+        for number, num_needed, index, payload in fragments:
+            self._open.setdefault(number, _Open(num_needed)).fragments[index] = payload
+            self._num_items = max(self._num_items, number + 1)
+
     def report(self) -> PeerReport:
         """What to tell the sender."""
         last = min(self._num_items, self._base + _MAX_REPORTED)
