@@ -41,7 +41,7 @@ _HEADERS = {
 _MAX_ZOOM, _MIN_ZOOM = 10, -8
 _MAX_PAIRS = 8
 _MAX_BODY_BYTES = 10_000
-_SHARE = 0.25
+_SHARE = 0.2
 """Of a core, that pages which follow changes may cost: they are told of them less often."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]

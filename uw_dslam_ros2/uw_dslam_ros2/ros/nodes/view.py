@@ -38,7 +38,7 @@ from uw_dslam_ros2.view.showing import Showing
 __all__ = ["View", "main"]
 
 _LEAST_PERIOD_S = 0.2  # between two states that are shown
-_SHARE = 0.2
+_SHARE = 0.1
 """Of a core, that following a manager may cost: a large merge is followed less often."""
 _ANSWER_WITHIN_S = 20.0
 _SILENT_S = 10.0
