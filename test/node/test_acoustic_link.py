@@ -50,12 +50,13 @@ def fleet(ros_context, spinning):
     import contextlib
 
     @contextlib.contextmanager
-    def run(state="", **channel):
-        water = make(
+    def run(state="", blackouts_s=None, **channel):
+        run.water = water = make(
             ChannelNode,
             ros_context,
             vehicles=["auv_1", "auv_2"],
             time_scale=2.0,
+            **({"blackouts_s": blackouts_s} if blackouts_s else {}),
             **{f"channel__{name}": value for name, value in channel.items()},
         )
         run.links = links = [
@@ -97,6 +98,15 @@ def test_each_vehicle_gets_the_others_submaps_and_its_own_as_they_have_it(fleet,
         np.testing.assert_array_equal(mine.grid.values, theirs.grid.values)
         assert mine.T_odom_submap == theirs.T_odom_submap
         assert mine.grid.spec.resolution_m == pytest.approx(0.1)
+
+
+def test_nothing_arrives_in_a_blackout_and_all_of_it_afterwards(fleet):
+    with fleet(blackouts_s=[0.0, 8.0]) as (until, send, got):
+        send(room_submap("auv_1", 0))
+        until(lambda: fleet.water._report()[2]["blacked out"] > 0, "a packet that is lost")
+        assert not got[2]
+        until(lambda: got[2], "the submap")
+        assert fleet.water._now_s() > 8.0
 
 
 def test_a_link_goes_on_where_it_was_stopped(ros_context, spinning, tmp_path):
@@ -192,6 +202,8 @@ def test_a_killed_link_has_all_that_it_received_and_asks_for_nothing_again(
         ({"vehicles": ["a", "b"], "domains": ["1"]}, "domains 1 numbers"),
         ({"vehicles": ["a"], "domains": ["x"]}, "domains holds 'x'"),
         ({"vehicles": ["a"], "preset": "fast"}, "expected one of nano, rate0, psk5"),
+        ({"vehicles": ["a"], "blackouts_s": [5.0]}, "times that increase, an even number"),
+        ({"vehicles": ["a"], "blackouts_s": [5.0, 2.0]}, "times that increase, an even number"),
     ],
 )
 def test_a_channel_without_sense_is_refused(ros_context, settings, text):

@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import rclpy
@@ -59,7 +60,9 @@ class ChannelNode(Node):
                 f"parameter vehicles has {len(names)} names and domains {len(domains)} numbers; "
                 "expected at least one name, and a domain for each or none"
             )
-        self._water = SharedChannel(self._channel_config, range(len(names)))
+        self._water = SharedChannel(
+            self._channel_config, range(len(names)), _blackouts(self._config.blackouts_s)
+        )
         self._modems = [
             _Modem(
                 name.strip("/"), (self._config.spacing_m * k, 0.0), self._water.next_turn(k, 0.0)
@@ -181,6 +184,7 @@ class ChannelNode(Node):
                 "lost": counts.lost,
                 "collided": counts.collided,
                 "out of range": counts.out_of_range,
+                "blacked out": counts.blacked_out,
                 "turns not used": self._num_missed,
             }
         return "info", f"{counts.sent} packets sent, {counts.delivered} delivered", values
@@ -190,6 +194,15 @@ def _domain(text: str) -> int:
     if not (text.isdigit() and int(text) <= _MAX_DOMAIN):
         raise ConfigError(f"parameter domains holds {text!r}, expected 0 to {_MAX_DOMAIN}")
     return int(text)
+
+
+def _blackouts(times_s: tuple[float, ...]) -> list[tuple[float, float]]:
+    if len(times_s) % 2 or any(a >= b for a, b in pairwise(times_s)):
+        raise ConfigError(
+            f"parameter blackouts_s is {list(times_s)}, expected times that increase, "
+            "an even number of them"
+        )
+    return list(zip(times_s[::2], times_s[1::2], strict=True))
 
 
 def _spin(executor: SingleThreadedExecutor) -> None:

@@ -215,6 +215,10 @@ class ChannelNodeConfig(Config):
         doc="a documented modem: nano, rate0 or psk5; empty: by the settings of channel",
     )
     spacing_m: float = setting(60.0, 0.0, 1e5, "between one vehicle and the next [m]")
+    blackouts_s: tuple[float, ...] = setting(
+        (),
+        doc="when nothing arrives: begin and end, begin and end, ... [s since the start]",
+    )
     time_scale: float = setting(1.0, 0.01, 1000.0, "seconds that pass in a second")
 
 
