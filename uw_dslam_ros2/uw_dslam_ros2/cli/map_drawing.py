@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.outcome import Trajectory
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.metrics import ends_of_rows
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = [
@@ -44,6 +46,7 @@ __all__ = [
     "scale_bar",
     "set_title",
     "shade_handles",
+    "show_cells",
     "show_map",
     "show_picture",
     "single_map",
@@ -51,6 +54,7 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
+Color = tuple[float, float, float]
 
 # Okabe and Ito's colours, which people with any colour vision tell apart.
 VEHICLE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -63,6 +67,7 @@ AGREE_COLOR, EXTRA_COLOR, MISSING_COLOR = (
 SEEN_COLOR = (0.93, 0.94, 0.95)
 INK = "#1c2733"
 _MAX_PIXELS = 1600
+_STRIP_ROWS = 256
 _MARGIN_CELLS = 12
 GAP, HEAD, TITLE, FOOT = 0.25, 0.75, 0.32, 0.42  # inches
 
@@ -125,22 +130,41 @@ def show_map(axes: Axes, occupancy: OccupancyMap) -> None:
     shades = (1.0 - share) * np.array(FREE_COLOR) + share * np.array(WALL_COLOR)
     table = np.rint(255.0 * np.vstack([UNKNOWN_COLOR, shades])).astype(np.uint8)
     low, high = cropped(occupancy)
-    picture = table[values[low[0] : high[0], low[1] : high[1]] - UNKNOWN]
-    show_picture(axes, picture, occupancy.spec, low, high)
+    cells = values[low[0] : high[0], low[1] : high[1]]
+    _show(axes, cells, lambda strip: table[strip - UNKNOWN], occupancy.spec, low, high)
 
 
-def show_picture(
-    axes: Axes,
-    picture: NDArray[np.uint8],
-    spec: GridSpec,
-    low: NDArray[np.int64] | None = None,
-    high: NDArray[np.int64] | None = None,
+def show_cells(
+    axes: Axes, cells: NDArray[np.uint8], colors: Sequence[Color], spec: GridSpec
 ) -> None:
-    """Show a picture of the cells from `low` to `high` as they lie; thin walls stay visible."""
-    low = np.zeros(2, np.int64) if low is None else low
-    high = np.array(spec.shape) if high is None else high
-    factor = max(1, math.ceil(max(picture.shape[:2]) / _MAX_PIXELS))
-    picture = darkest(picture, factor)
+    """Show cells (R, C), each the number of its colour, as they lie; thin walls stay visible."""
+    table = np.array([to_bytes(color) for color in colors])
+    _show(axes, cells, lambda strip: table[strip], spec, *_ends_of(spec))
+
+
+def show_picture(axes: Axes, picture: NDArray[np.uint8], spec: GridSpec) -> None:
+    """Show a picture (R, C, 3) of all cells as they lie; thin walls stay visible."""
+    _show(axes, picture, lambda strip: strip, spec, *_ends_of(spec))
+
+
+def _ends_of(spec: GridSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return np.zeros(2, np.int64), np.array(spec.shape)
+
+
+def _show(
+    axes: Axes,
+    cells: NDArray[Any],
+    colors_of: Callable[[NDArray[Any]], NDArray[np.uint8]],
+    spec: GridSpec,
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+) -> None:
+    """Show the cells from `low` to `high`; ``colors_of`` makes a picture of some rows of them."""
+    factor = max(1, math.ceil(max(cells.shape[:2]) / _MAX_PIXELS))
+    # By strips: in colours, and with room at the edges, a large map would be there many times.
+    step = factor * max(1, _STRIP_ROWS // factor)
+    strips = [cells[row : row + step] for row in range(0, len(cells), step)]
+    picture = np.concatenate([darkest(colors_of(strip), factor) for strip in strips])
     resolution = spec.resolution_m
     first = low * resolution
     last = first + np.array(picture.shape[:2]) * factor * resolution
@@ -167,7 +191,7 @@ def show_picture(
         spine.set_color("#c4cad0")
 
 
-def to_bytes(color: tuple[float, float, float]) -> NDArray[np.uint8]:
+def to_bytes(color: Color) -> NDArray[np.uint8]:
     """A colour (3,) as a picture holds it."""
     return np.rint(255.0 * np.array(color)).astype(np.uint8)
 
@@ -273,9 +297,9 @@ def near_walls(walls: NDArray[np.bool_], distance_cells: float) -> NDArray[np.bo
 
 def common_spec(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> GridSpec:
     """Take the target's cells, over all that either map knows."""
-    known = np.argwhere(source.known)
+    known = ends_of_rows(source.known)
     cells = target.spec.cells_of(T_target_source.apply(source.spec.centers_of(known)))
-    own = np.argwhere(target.known)
+    own = ends_of_rows(target.known)
     every = np.concatenate([cells, own]) if len(own) else cells
     low, high = every.min(axis=0) - _MARGIN_CELLS, every.max(axis=0) + 1 + _MARGIN_CELLS
     resolution = target.spec.resolution_m

@@ -39,6 +39,7 @@ from uw_dslam_ros2.cli.map_drawing import (
     scale_bar,
     set_title,
     shade_handles,
+    show_cells,
     show_map,
     show_picture,
     single_map,
@@ -63,6 +64,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 DECIDED_COLOR = "#5b2a86"
+_COMPARED = (UNKNOWN_COLOR, SEEN_COLOR, FREE_COLOR, MISSING_COLOR, AGREE_COLOR, EXTRA_COLOR)
+_UNKNOWN, _SEEN, _FREE, _MISSING, _AGREE, _EXTRA = range(len(_COMPARED))
 
 
 def vehicle_colors(vehicles: Sequence[str]) -> dict[str, str]:
@@ -251,15 +254,14 @@ def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure |
     tolerance_cells = 0.25 / spec.resolution_m
     near_true = near_walls(true > 50, tolerance_cells)
     near_found = near_walls(found > 50, tolerance_cells)
-    picture = np.empty((*spec.shape, 3), dtype=np.uint8)
-    picture[:] = to_bytes(UNKNOWN_COLOR)
-    picture[(found >= 0) | (true >= 0)] = to_bytes(SEEN_COLOR)
-    picture[found >= 0] = to_bytes(FREE_COLOR)
-    picture[(true > 50) & ~near_found] = to_bytes(MISSING_COLOR)
-    picture[(found > 50) & near_true] = to_bytes(AGREE_COLOR)
-    picture[(found > 50) & ~near_true] = to_bytes(EXTRA_COLOR)
+    shown = np.full(spec.shape, _UNKNOWN, np.uint8)
+    shown[(found >= 0) | (true >= 0)] = _SEEN
+    shown[found >= 0] = _FREE
+    shown[(true > 50) & ~near_found] = _MISSING
+    shown[(found > 50) & near_true] = _AGREE
+    shown[(found > 50) & ~near_true] = _EXTRA
     figure, axes = single_map(spec)
-    show_picture(axes, picture, spec)
+    show_cells(axes, shown, _COMPARED, spec)
     scale_bar(axes)
     legend_below(
         axes,

@@ -27,6 +27,7 @@ __all__ = [
     "TrajectoryError",
     "align_points",
     "compare_maps",
+    "ends_of_rows",
     "interpolate_poses",
     "map_sharpness",
     "resample",
@@ -301,13 +302,13 @@ def map_sharpness(occupancy: OccupancyMap) -> MapSharpness:
         return MapSharpness(math.nan, math.nan, math.nan, math.nan)
     percent = np.clip(np.arange(101) / 100.0, 1e-12, 1.0 - 1e-12)
     of_percent = -(percent * np.log2(percent) + (1.0 - percent) * np.log2(1.0 - percent))
-    entropy = of_percent[np.maximum(occupancy.values, 0)]
+    entropy_bits = float(of_percent[occupancy.values[known]].mean())
     if not walls.any():
-        return MapSharpness(float(entropy[known].mean()), math.nan, 0.0, math.nan)
+        return MapSharpness(entropy_bits, math.nan, 0.0, math.nan)
     near = known & _within(walls, 2.0)
     return MapSharpness(
-        entropy_bits=float(entropy[known].mean()),
-        wall_entropy_bits=float(entropy[near].mean()),
+        entropy_bits=entropy_bits,
+        wall_entropy_bits=float(of_percent[occupancy.values[near]].mean()),
         wall_share=float(walls.sum() / known.sum()),
         wall_thickness_cells=float(walls.sum() / skeletonize(walls).sum()),
     )
@@ -342,7 +343,7 @@ def _picture(values: NDArray[np.int8]) -> FloatArray:
 
 def _covering(spec: GridSpec, other: OccupancyMap, T_frame_other: SE2) -> GridSpec:
     """Extend a grid by whole cells to cover all that another map knows."""
-    known = _ends_of_rows(other.known)
+    known = ends_of_rows(other.known)
     if len(known) == 0:
         return spec
     cells = spec.cells_of(T_frame_other.apply(other.spec.centers_of(known)))
@@ -355,7 +356,7 @@ def _covering(spec: GridSpec, other: OccupancyMap, T_frame_other: SE2) -> GridSp
     return GridSpec(spec.resolution_m, num_rows, num_cols, corner)
 
 
-def _ends_of_rows(mask: BoolArray) -> IntArray:
+def ends_of_rows(mask: BoolArray) -> IntArray:
     """First and last cell (N, 2) of each row that has any: no other lies farther out."""
     rows = np.flatnonzero(mask.any(axis=1))
     first = mask[rows].argmax(axis=1)

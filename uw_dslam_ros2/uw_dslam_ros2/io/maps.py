@@ -27,12 +27,15 @@ _OCCUPIED_THRESH = 0.65
 _FREE_THRESH = 0.196
 _PIXEL_OCCUPIED, _PIXEL_FREE, _PIXEL_UNKNOWN = 0, 254, 205
 _RAW_UNKNOWN = 255
+_SHADES = np.append(
+    np.rint(254.0 * (1.0 - np.arange(OCCUPIED + 1) / 100.0)), _PIXEL_UNKNOWN
+).astype(np.uint8)
+"""Grey of each value; that of -1 is the last."""
 
 
 def image_of(occupancy: OccupancyMap) -> NDArray[np.uint8]:
     """Picture (R, C), first row on top: white is free, black occupied, 205 unknown."""
-    shade = np.rint(254.0 * (1.0 - occupancy.values / 100.0)).astype(np.uint8)
-    return np.flipud(np.where(occupancy.known, shade, np.uint8(_PIXEL_UNKNOWN)))
+    return np.flipud(_SHADES[occupancy.values])
 
 
 def write_map(

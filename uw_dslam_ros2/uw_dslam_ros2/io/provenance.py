@@ -97,9 +97,10 @@ def contradictions_png(provenance: MapProvenance) -> bytes:
     """Picture of where submaps disagree, as `write_provenance` describes it."""
     import cv2  # large, and not every program has pictures
 
-    colors = np.array([_AGREED, *_DISPUTED], dtype=np.uint8)
-    pixels = colors[np.minimum(provenance.contradictions, len(_DISPUTED))]
-    pixels[provenance.owners == 0] = _NOT_SEEN
-    is_done, content = cv2.imencode(".png", np.flipud(pixels))
+    colors = np.array([_AGREED, *_DISPUTED, _NOT_SEEN], dtype=np.uint8)
+    # Which colour first: three bytes a cell are needed once, and upside down.
+    which = np.minimum(provenance.contradictions, len(_DISPUTED)).astype(np.uint8)
+    which[provenance.owners == 0] = len(colors) - 1
+    is_done, content = cv2.imencode(".png", colors[np.flipud(which)])
     assert is_done
     return content.tobytes()
