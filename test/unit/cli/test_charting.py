@@ -7,6 +7,7 @@ import pytest
 
 from uw_dslam_ros2.cli.charting import chart_tracks, charted
 from uw_dslam_ros2.cli.outcome import outcome_of
+from uw_dslam_ros2.core.chart import drawing
 from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart
 from uw_dslam_ros2.core.chart.pings import pack_ping
 from uw_dslam_ros2.core.errors import InvalidInputError
@@ -103,6 +104,30 @@ def test_a_track_has_one_pose_for_each_ping(run):
 
 def test_no_pings_are_no_chart():
     assert draw_chart([], CONFIG, 8.0) is None
+
+
+@pytest.mark.parametrize("side", [16, 50])
+def test_a_chart_drawn_in_blocks_is_the_whole_chart(run, monkeypatch, side):
+    _, pings = run
+    own = [ping for pings_of_submap in pings.values() for ping in pings_of_submap]
+    poses = np.array([(1.5 * k, -0.7 * k, 0.4 * k) for k in range(len(own))])
+    whole = GrowingGrid(CONFIG)
+    for ping, pose in zip(own, poses, strict=True):
+        whole.add(ping.detections(), SE2.from_array(pose))
+    expected = whole.trimmed().to_occupancy(8.0)
+    monkeypatch.setattr(drawing, "_BLOCK_SIDE", side)
+    chart = draw_chart([PingTrack(own, poses)], CONFIG, 8.0)
+    assert chart.spec == expected.spec
+    assert np.array_equal(chart.values, expected.values)
+
+
+def test_a_chart_that_would_be_too_large_is_told_and_the_sum_stays(run, monkeypatch):
+    outcome, pings = run
+    monkeypatch.setattr(drawing, "MAX_MAP_SIDE", 50)
+    told = []
+    assert charted(outcome, pings, OccupancyConfig(), told.append) is outcome
+    assert [finding.kind for finding in told] == ["no_chart"]
+    assert "expected at most 50 a side" in told[0].detail
 
 
 def test_a_kept_ping_is_the_ping():

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.cli.outcome import Outcome, VehicleOutcome
 from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart, refined
 from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
@@ -50,9 +51,13 @@ def charted(
             if pings_of_track.range_scale != 1.0:
                 tell(_too_long(track.vehicle_id, pings_of_track.range_scale))
     resolution_m = outcome.global_map.spec.resolution_m
-    chart = draw_chart(
-        list(after.values()), dataclasses.replace(config, resolution_m=resolution_m), LOG_ODDS_MAX
-    )
+    config = dataclasses.replace(config, resolution_m=resolution_m)
+    try:
+        chart = draw_chart(list(after.values()), config, LOG_ODDS_MAX)
+    except InvalidInputError as error:
+        if tell is not None:
+            tell(Finding("no_chart", "", f"{error}; the map is the sum of the submaps instead"))
+        return outcome
     vehicles = tuple(_bent(vehicle, before, after) for vehicle in outcome.vehicles)
     return dataclasses.replace(outcome, global_map=chart, vehicles=vehicles)
 

@@ -14,6 +14,7 @@ from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = [
     "FREE",
+    "MAX_MAP_SIDE",
     "OCCUPIED",
     "UNITS_PER_NAT",
     "UNKNOWN",
@@ -30,6 +31,9 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 
 UNITS_PER_NAT = 1000.0
 """Log-odds are summed in integers of a thousandth of a nat: the same in any order."""
+
+MAX_MAP_SIDE = 20_000
+"""Rows and columns of the largest map that is made whole: to be shown, sent, written, matched."""
 
 UNSEEN = np.int16(-32768)
 """Instead of log-odds: nothing was observed."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +19,10 @@ from uw_dslam_ros2.core.chart.refine import (
     refine_tracks,
 )
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.occupancy import SIGHT_CELLS, GrowingGrid, box_of
+from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["PingTrack", "draw_chart", "refined"]
@@ -29,6 +31,8 @@ FloatArray = NDArray[np.float64]
 
 _BLOCK_M, _BLOCK_CELLS = 0.5, 6.0
 """A wall is straight within squares of this side, and as many cells of the map more."""
+_BLOCK_SIDE = 2048
+"""Cells of the map are summed in squares of this side, one after the other."""
 _ROUNDED = 5
 """Digits kept of metres and radians: an equation's last digits depend on the machine."""
 
@@ -102,9 +106,66 @@ def draw_chart(
         Grid and sensor model.
     log_odds_max
         Limit of a cell's log-odds.
+
+    Raises
+    ------
+    InvalidInputError
+        If the map would be too large.
     """
-    grid = GrowingGrid(config)
-    for track in tracks:
-        for ping, pose in zip(track.pings, track.T_map_sonar, strict=True):
-            grid.add(ping.detections(track.range_scale), SE2.from_array(pose))
-    return grid.trimmed().to_occupancy(log_odds_max) if grid.num_pings else None
+    pings = [
+        (ping, track.range_scale, SE2.from_array(pose))
+        for track in tracks
+        for ping, pose in zip(track.pings, track.T_map_sonar, strict=True)
+    ]
+    if not pings:
+        return None
+    lattice = GrowingGrid(config)
+    reach = [lattice.reach_of(ping.detections(scale), motion) for ping, scale, motion in pings]
+    whole = functools.reduce(Window.union, reach)
+    if max(whole.shape) > MAX_MAP_SIDE:
+        raise InvalidInputError(
+            f"the chart would have {whole.shape[0]} x {whole.shape[1]} cells of "
+            f"{config.resolution_m:g} m, expected at most {MAX_MAP_SIDE} a side"
+        )
+    values = np.full(whole.shape, UNKNOWN, np.int8)
+    for block in _blocks(whole):
+        near = [p for p, own in zip(pings, reach, strict=True) if _meet(own, block)]
+        if near:
+            grid = GrowingGrid(config, _grown(block))
+            for ping, scale, motion in near:
+                grid.add(ping.detections(scale), motion)
+            drawn, percent = grid.percent(log_odds_max)
+            common = drawn.intersection(block)
+            if min(common.shape) > 0:
+                values[common.slices(whole)] = percent[common.slices(drawn)]
+    return _trimmed(whole, values, config.resolution_m)
+
+
+def _blocks(whole: Window) -> Iterator[Window]:
+    """Squares that cover it: what is summed takes ten times the room of what is drawn."""
+    for row in range(whole.row_0, whole.row_1, _BLOCK_SIDE):
+        for col in range(whole.col_0, whole.col_1, _BLOCK_SIDE):
+            yield Window(row, col, row + _BLOCK_SIDE, col + _BLOCK_SIDE).intersection(whole)
+
+
+def _grown(block: Window) -> Window:
+    return Window(
+        block.row_0 - SIGHT_CELLS,
+        block.col_0 - SIGHT_CELLS,
+        block.row_1 + SIGHT_CELLS,
+        block.col_1 + SIGHT_CELLS,
+    )
+
+
+def _meet(reach: Window, block: Window) -> bool:
+    return min(reach.intersection(_grown(block)).shape) > 0
+
+
+def _trimmed(whole: Window, values: NDArray[np.int8], resolution_m: float) -> OccupancyMap:
+    """What is known, at least one cell."""
+    box = box_of(values != UNKNOWN)
+    row, col = (0, 0) if box is None else (whole.row_0 + box[0].start, whole.col_0 + box[1].start)
+    known = np.full((1, 1), UNKNOWN, np.int8) if box is None else values[box].copy()
+    corner = SE2(col * resolution_m, row * resolution_m)
+    num_rows, num_cols = known.shape
+    return OccupancyMap(GridSpec(resolution_m, num_rows, num_cols, corner), known)

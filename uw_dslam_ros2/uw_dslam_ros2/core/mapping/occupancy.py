@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,10 +26,14 @@ from uw_dslam_ros2.core.mapping.grid_kernels import (
     beam_table,
     draw_faces,
 )
+from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import Detections
 
-__all__ = ["CompressedGrid", "GrowingGrid", "LogOddsGrid"]
+__all__ = ["SIGHT_CELLS", "CompressedGrid", "GrowingGrid", "LogOddsGrid", "box_of"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _MAX_SPREAD_M = 0.5
 """Largest half width of an echo across the beam: far off, a wide one would paint whole arcs."""
@@ -44,9 +49,12 @@ _SMOOTHING_GAIN = math.sqrt(1.0 + 2.0 / _LEAST_SIGMA_CELLS**2)
 """Keeps the height of a long wall; a lone echo sinks to half of what it said."""
 _TAIL_REACH_CELLS, _TAIL_SHARE = 6, 0.3
 """A crest so much lower than what lies so near is a tail of that."""
+SIGHT_CELLS = _TAIL_REACH_CELLS + _MARGIN_CELLS
+"""What lies farther off does not count for a cell."""
 
 # Growing means copying everything, so it goes in long steps.
 _TILE = 256
+_BAND_ROWS = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,26 +83,21 @@ class LogOddsGrid:
 
     def trimmed(self) -> LogOddsGrid:
         """A copy of the observed part, at least one cell."""
-        rows = np.flatnonzero(self.observed.any(axis=1))
-        cols = np.flatnonzero(self.observed.any(axis=0))
-        if len(rows) == 0:
-            nothing = np.zeros((1, 1), np.int32), np.zeros((1, 1), np.bool_)
-            return LogOddsGrid(*nothing, 0, 0, self.resolution_m)
-        window = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
+        window = box_of(self.observed)
+        if window is None:
+            return _nothing(self.resolution_m)
         return LogOddsGrid(
             self.log_odds[window].copy(),
             self.observed[window].copy(),
-            self.row + int(rows[0]),
-            self.col + int(cols[0]),
+            self.row + window[0].start,
+            self.col + window[1].start,
             self.resolution_m,
         )
 
     def to_occupancy(self, log_odds_max: float) -> OccupancyMap:
         """Probability in percent."""
-        table = percent_table(log_odds_max)
-        limit = len(table) // 2
-        values = table[np.clip(self.log_odds, -limit, limit) + limit]
-        return OccupancyMap(self.spec, np.where(self.observed, values, np.int8(UNKNOWN)))
+        percent = _percent(self.log_odds, self.observed, percent_table(log_odds_max))
+        return OccupancyMap(self.spec, percent)
 
     def compressed(self) -> CompressedGrid:
         """Compressed for keeping; log-odds are cut at 32 nats."""
@@ -129,6 +132,25 @@ class CompressedGrid:
         return LogOddsGrid(log_odds, observed, self.row, self.col, self.resolution_m)
 
 
+def _percent(
+    log_odds: NDArray[np.int32], observed: BoolArray, table: NDArray[np.int8]
+) -> NDArray[np.int8]:
+    limit = len(table) // 2
+    return np.where(observed, table[np.clip(log_odds, -limit, limit) + limit], np.int8(UNKNOWN))
+
+
+def box_of(mask: BoolArray) -> tuple[slice, slice] | None:
+    """Rows and columns of a rectangle around all that is set."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return None
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+def _nothing(resolution_m: float) -> LogOddsGrid:
+    return LogOddsGrid(np.zeros((1, 1), np.int32), np.zeros((1, 1), np.bool_), 0, 0, resolution_m)
+
+
 def _spec_of(shape: tuple[int, int], row: int, col: int, resolution_m: float) -> GridSpec:
     return GridSpec(resolution_m, *shape, SE2(col * resolution_m, row * resolution_m))
 
@@ -138,24 +160,35 @@ class GrowingGrid:
 
     It grows by whole tiles, so cells never move by fractions. Both are kept apart until a map is
     drawn, because where a wall's face lies is seen from all its echoes together only.
+
+    Parameters
+    ----------
+    config
+        Grid and sensor model.
+    only
+        Lattice cells that are looked at, however far pings reach; None: all.
     """
 
-    def __init__(self, config: OccupancyConfig = OccupancyConfig()) -> None:  # noqa: B008 (frozen)
+    def __init__(
+        self,
+        config: OccupancyConfig = OccupancyConfig(),  # noqa: B008 (frozen)
+        only: Window | None = None,
+    ) -> None:
         self._config = config
-        self._row, self._col = 0, 0
-        self._echoes = np.zeros((0, 0), np.int32)
-        self._water = np.zeros((0, 0), np.int32)
-        self._scratch = np.zeros((0, 0), np.int16)
+        self._is_fixed = only is not None
+        window = only or Window(0, 0, 0, 0)
+        self._row, self._col = window.row_0, window.col_0
+        self._echoes = np.zeros(window.shape, np.int32)
+        self._water = np.zeros(window.shape, np.int32)
+        self._scratch = np.zeros(window.shape, np.int16)
         self.num_pings = 0
 
     def add(self, detections: Detections, T_frame_sonar: SE2) -> None:
         """Add one ping, seen from ``T_frame_sonar``."""
         config = self._config
-        free_range = np.minimum(
-            detections.free_range_m - config.free_margin_m, config.free_range_max_m
-        )
-        free_range = np.maximum(free_range, 0.0)
-        self._grow_for(detections, T_frame_sonar, float(free_range.max(initial=0.0)))
+        free_range = self._free_range_m(detections)
+        if not self._is_fixed:
+            self._grow_to(self.reach_of(detections, T_frame_sonar))
         beams = beam_table(detections.bearing_rad, 0.75 * detections.beamwidth_rad, NUM_DIRECTIONS)
         add_ping(
             self._echoes, self._water, self._scratch, self._row, self._col,
@@ -167,34 +200,10 @@ class GrowingGrid:
         )  # fmt: skip
         self.num_pings += 1
 
-    def trimmed(self) -> LogOddsGrid:
-        """The observed part as a map, at least one cell."""
+    def reach_of(self, detections: Detections, T_frame_sonar: SE2) -> Window:
+        """Lattice cells that a ping may touch."""
         config = self._config
-        seen = (self._echoes > 0) | (self._water > 0)
-        rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-        if len(rows) == 0:
-            nothing = np.zeros((1, 1), np.int32), np.zeros((1, 1), np.bool_)
-            return LogOddsGrid(*nothing, 0, 0, config.resolution_m)
-        # A heap of echoes is wider than the cells that they lie in.
-        row, col = (max(0, int(seen[0]) - _MARGIN_CELLS) for seen in (rows, cols))
-        window = slice(row, rows[-1] + 1 + _MARGIN_CELLS), slice(col, cols[-1] + 1 + _MARGIN_CELLS)
-        log_odds, observed = draw_faces(
-            self._echoes[window],
-            self._water[window],
-            _SMOOTHING,
-            _SMOOTHING_GAIN,
-            round(config.free_log_odds * UNITS_PER_NAT),
-            _FACE_CELLS,
-            _TAIL_REACH_CELLS,
-            _TAIL_SHARE,
-        )
-        drawn = LogOddsGrid(
-            log_odds, observed, self._row + row, self._col + col, config.resolution_m
-        )
-        return drawn.trimmed()
-
-    def _grow_for(self, detections: Detections, T_frame_sonar: SE2, reach_m: float) -> None:
-        config = self._config
+        reach_m = float(self._free_range_m(detections).max(initial=0.0))
         points = T_frame_sonar.apply(detections.points)
         margin = 3.0 * (_MAX_SPREAD_M + detections.range_sigma_m)
         margin += (1 + _MARGIN_CELLS) * config.resolution_m
@@ -205,13 +214,82 @@ class GrowingGrid:
             raise InvalidInputError(
                 "a ping reaches to infinity, expected finite points and ranges"
             )
-        first = np.floor(low / config.resolution_m).astype(np.int64)[::-1]
-        last = np.floor(high / config.resolution_m).astype(np.int64)[::-1]
+        col_0, row_0 = np.floor(low / config.resolution_m).astype(np.int64).tolist()
+        col_1, row_1 = np.floor(high / config.resolution_m).astype(np.int64).tolist()
+        return Window(row_0, col_0, row_1 + 1, col_1 + 1)
+
+    def trimmed(self) -> LogOddsGrid:
+        """The observed part as a map, at least one cell."""
+        row, col, shape = self._reached()
+        log_odds, observed = np.zeros(shape, np.int32), np.zeros(shape, np.bool_)
+        for rows, *band in self._bands():
+            log_odds[rows], observed[rows] = band
+        resolution_m = self._config.resolution_m
+        return LogOddsGrid(log_odds, observed, row, col, resolution_m).trimmed()
+
+    def percent(self, log_odds_max: float) -> tuple[Window, NDArray[np.int8]]:
+        """Probability in percent, -1 where nothing was observed, of the lattice cells reached."""
+        row, col, shape = self._reached()
+        values, table = np.full(shape, UNKNOWN, np.int8), percent_table(log_odds_max)
+        for rows, log_odds, observed in self._bands():
+            values[rows] = _percent(log_odds, observed, table)
+        return Window(row, col, row + shape[0], col + shape[1]), values
+
+    def _reached(self) -> tuple[int, int, tuple[int, int]]:
+        """Lattice cell where all that can be drawn begins, and its rows and columns."""
+        rows, cols = self._window()
+        shape = rows.stop - rows.start, cols.stop - cols.start
+        return self._row + rows.start, self._col + cols.start, shape
+
+    def _window(self) -> tuple[slice, slice]:
+        box = box_of((self._echoes > 0) | (self._water > 0))
+        if box is None:
+            return slice(0, 0), slice(0, 0)
+        # A heap of echoes is wider than the cells that they lie in.
+        rows, cols = (
+            slice(max(0, own.start - _MARGIN_CELLS), min(num, own.stop + _MARGIN_CELLS))
+            for own, num in zip(box, self._echoes.shape, strict=True)
+        )
+        return rows, cols
+
+    def _bands(self) -> Iterator[tuple[slice, NDArray[np.int32], BoolArray]]:
+        """What is drawn, by bands of rows: which, their log-odds, and what of them is observed.
+
+        What of a large map is needed on the way to that is many times as large.
+        """
+        window, cols = self._window()
+        for first in range(window.start, window.stop, _BAND_ROWS):
+            last = min(first + _BAND_ROWS, window.stop)
+            low = max(window.start, first - SIGHT_CELLS)
+            around = slice(low, min(window.stop, last + SIGHT_CELLS))
+            log_odds, observed = draw_faces(
+                self._echoes[around, cols],
+                self._water[around, cols],
+                _SMOOTHING,
+                _SMOOTHING_GAIN,
+                round(self._config.free_log_odds * UNITS_PER_NAT),
+                _FACE_CELLS,
+                _TAIL_REACH_CELLS,
+                _TAIL_SHARE,
+            )
+            inside = slice(first - low, last - low)
+            rows = slice(first - window.start, last - window.start)
+            yield rows, log_odds[inside], observed[inside]
+
+    def _free_range_m(self, detections: Detections) -> FloatArray:
+        config = self._config
+        free_range = np.minimum(
+            detections.free_range_m - config.free_margin_m, config.free_range_max_m
+        )
+        return np.maximum(free_range, 0.0)
+
+    def _grow_to(self, reach: Window) -> None:
+        first, last = (reach.row_0, reach.col_0), (reach.row_1 - 1, reach.col_1 - 1)
         num_rows, num_cols = self._echoes.shape
         if self._echoes.size:
             old_last = (self._row + num_rows - 1, self._col + num_cols - 1)
-            first = np.minimum(first, (self._row, self._col))
-            last = np.maximum(last, old_last)
+            first = min(first[0], self._row), min(first[1], self._col)
+            last = max(last[0], old_last[0]), max(last[1], old_last[1])
         row, col = (math.floor(v / _TILE) * _TILE for v in first)
         rows, cols = (
             math.ceil((v + 1) / _TILE) * _TILE - start

@@ -11,7 +11,6 @@ __all__ = [
     "LOG_ODDS_MAX",
     "MAX_CHECKS",
     "MAX_MAP_CELLS",
-    "MAX_MAP_SIDE",
     "NUM_NEIGHBOURS",
     "VAGUE_CELLS",
     "MapQueueConfig",
@@ -29,8 +28,6 @@ LOG_ODDS_MAX = 8.0
 """Limit of the log-odds of merged cells: twice that of a vehicle's own map, so that two that
 agree are surer than one, and a third can still change it.
 """
-MAX_MAP_SIDE = 20_000
-"""Rows and columns of the largest map that is made whole, to be sent, written or matched."""
 MAX_MAP_CELLS = 100_000_000
 INLIER_PROBABILITY = 0.99
 """Share of right edges that the chi-square test of an edge keeps."""

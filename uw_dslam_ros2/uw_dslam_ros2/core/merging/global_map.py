@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging.config import MAX_MAP_CELLS, MAX_MAP_SIDE
+from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging.config import MAX_MAP_CELLS
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, joint_box, lattice_box
 from uw_dslam_ros2.core.merging.types import MapProvenance
 from uw_dslam_ros2.core.mosaic import Mosaic, Window

@@ -9,8 +9,9 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from uw_dslam_ros2.core.grid import MAX_MAP_SIDE
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
-from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX, MAX_MAP_SIDE
+from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.merging.global_map import Piece, draw_pieces, pinned_lattice
 from uw_dslam_ros2.core.mosaic import Mosaic
 from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg, stamp_to_msg

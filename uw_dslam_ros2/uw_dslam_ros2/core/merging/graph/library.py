@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, OccupancyMap
 from uw_dslam_ros2.core.merging.config import (
     INLIER_PROBABILITY,
     LOG_ODDS_MAX,
     MAX_MAP_CELLS,
-    MAX_MAP_SIDE,
     NUM_NEIGHBOURS,
 )
 from uw_dslam_ros2.core.merging.decisions import DecisionLog
