@@ -6,10 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.grid import UNITS_PER_NAT, GridSpec
+from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNITS_PER_NAT, GridSpec
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.mapping.grid_kernels import beam_table, diamond
 from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.section import ClosedSection
+from uw_dslam_ros2.core.mapping.vehicle_map import VehicleMap
 from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import Detections
@@ -244,3 +246,24 @@ def test_a_compressed_grid_is_drawn_as_the_grid_itself(rng):
         np.testing.assert_array_equal(fused.values, direct.values)
         off = fused.spec.T_frame_grid.distance_to(direct.spec.T_frame_grid)
         assert off == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_a_vehicles_map_leaves_out_what_would_make_it_too_large():
+    grid = GrowingGrid(CONFIG)
+    grid.add(ping([3.0], [0.0]), SE2())
+    kept = grid.trimmed().compressed()
+    away_m = CONFIG.resolution_m * MAX_MAP_SIDE
+
+    def section(number, T_odom_issued):
+        none = np.empty((0, 2)), np.empty(0), np.empty((0, 3)), np.empty(0, np.int64)
+        return ClosedSection(number, 0, kept, *none, np.eye(3), np.eye(3), T_odom_issued)
+
+    sections = [section(0, SE2()), section(1, SE2(away_m, 0.0)), section(2, SE2(5.0, 0.0))]
+    vehicle_map = VehicleMap(CONFIG)
+    for _ in range(2):  # what was left out once is not tried again and again, and not forgotten
+        occupancy = vehicle_map.draw(sections, None, SE2())
+        assert vehicle_map.num_left_out == 1
+        assert max(occupancy.spec.shape) < 200
+    sections[1].T_odom_issued = SE2(10.0, 0.0)
+    assert max(vehicle_map.draw(sections, None, SE2()).spec.shape) > 100
+    assert vehicle_map.num_left_out == 0

@@ -22,6 +22,8 @@ __all__ = ["LocalMap", "joined"]
 
 FloatArray = NDArray[np.float64]
 _COARSEST = 8.0
+_MAX_PINGS = 200
+"""A vehicle at rest has no path after which its pings would go."""
 _MIN_POINTS = 20
 """Fewer echoes than this, of the ping or known ones, say too little of a pose."""
 _MAX_POINTS = 300
@@ -67,7 +69,10 @@ class LocalMap:
             self._path_length_m += self._last.distance_to(T_submap_base)[0]
         self._last = T_submap_base
         self._pings.append((points, weight, self._path_length_m))
-        while self._path_length_m - self._pings[0][2] > self._config.local_length_m:
+        while (
+            self._path_length_m - self._pings[0][2] > self._config.local_length_m
+            or len(self._pings) > _MAX_PINGS
+        ):
             self._pings.popleft()
 
     def rebase(self, T_new_old: SE2) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.mosaic import Mosaic
@@ -24,21 +24,41 @@ class VehicleMap:
     def __init__(self, config: OccupancyConfig) -> None:
         self._log_odds_max = config.log_odds_max
         self._mosaic = Mosaic(GridSpec(config.resolution_m, 1, 1))
+        self._left_out: dict[int, SE2] = {}
+
+    @property
+    def num_left_out(self) -> int:
+        """Submaps with which the map would have been too large, when it was last drawn."""
+        return len(self._left_out)
 
     def draw(
         self, closed: Sequence[ClosedSection], growing: OpenSection | None, T_odom_growing: SE2
     ) -> OccupancyMap:
-        """All submaps in odom; closed ones lie where they were last issued."""
+        """All submaps in odom; closed ones lie where they were last issued.
+
+        Those that would make it larger than maps are (`MAX_MAP_SIDE`) are left out.
+        """
         mosaic, newest = self._mosaic, len(closed)
         for index, section in enumerate(closed):
             pose = section.T_odom_issued
-            if mosaic.version_of(index) != pose:
+            if pose not in (mosaic.version_of(index), self._left_out.get(index)):
                 mosaic.put(index, pose, section.grid, pose)
+                if self._is_too_large():
+                    mosaic.remove(index)
+                    self._left_out[index] = pose
+                else:
+                    self._left_out.pop(index, None)
         if growing is not None:
             mosaic.put(newest, None, growing.grid.trimmed(), T_odom_growing)
+            if self._is_too_large():
+                mosaic.remove(newest)
         occupancy = mosaic.occupancy(self._log_odds_max)
         mosaic.remove(newest)
         return occupancy or OccupancyMap(mosaic.lattice, np.full((1, 1), UNKNOWN, np.int8))
+
+    def _is_too_large(self) -> bool:
+        window = self._mosaic.window()
+        return window is not None and max(window.shape) > MAX_MAP_SIDE
 
 
 def path_of(

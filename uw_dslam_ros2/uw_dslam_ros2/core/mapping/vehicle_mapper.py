@@ -335,6 +335,7 @@ class VehicleMapper:
             "num_matches": self._keys.num_matches,
             "match_overlap_last": self._keys.overlap_last,
             "num_submaps": len(self._closed),
+            "num_submaps_not_drawn": self._map.num_left_out,
             "num_loops": self._estimator.num_loops,
             "num_loops_believed": self._estimator.num_loops_believed,
             "velocity_age_s": age_s,
