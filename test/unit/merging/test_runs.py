@@ -70,6 +70,14 @@ def test_the_newest_run_says_where_its_vehicle_is():
     assert max(T_map_submap.distance_to(record.T_component_submap)) < 1e-6
 
 
+def test_people_read_the_second_run_instead_of_its_number():
+    queue = filled()
+    numbers = sorted({i.run_id for i in FLEET.submaps if i.vehicle_id == "auv_1"})
+    shown = {queue.in_words(f"auv_1#{number}/0 came") for number in numbers}
+    assert shown == {"auv_1/0 came", "auv_1#2/0 came"}
+    assert queue.in_words("auv_9#1936390121/0 came") == "auv_9#1936390121/0 came"
+
+
 def test_two_runs_may_use_the_same_numbers_but_one_run_may_not():
     queue = filled()
     submap = FLEET.submaps[SubmapId("auv_1", 77, 0)]

@@ -33,6 +33,7 @@ from uw_dslam_ros2.core.merging.types import (
 )
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.registration.result import RegistrationResult
+from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
@@ -265,6 +266,12 @@ class MapQueue:
         """A submap as it was last received; None if it never came."""
         held = self._submaps.get(submap_id)
         return None if held is None else held.submap
+
+    def in_words(self, text: str) -> str:
+        """A sentence with runs counted, ``auv_1#2/0``, instead of by numbers drawn at random."""
+        if "#" not in text:
+            return text
+        return RunNames(held.submap for held in self._submaps.values()).in_text(text)
 
     def answers(self) -> list[tuple[Answer, bool]]:
         """All answers, by target and source, and whether each holds in the pose graph."""

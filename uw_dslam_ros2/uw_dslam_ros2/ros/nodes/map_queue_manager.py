@@ -90,7 +90,9 @@ class MapQueueManager(ManagedNode):
         self._topics: set[str] = set()
         self._owners: dict[str, str] = {}
         self._requests = QueueRequests(self, self, self._config, self._worker.post)
-        self._missing = MissingSubmaps(self, self._worker.post, self._on_submap)
+        self._missing = MissingSubmaps(
+            self, self._worker.post, self._on_submap, lambda text: self._queue.in_words(text)
+        )
         self._maps = MapInputs(
             self,
             self._config.map_topics,
@@ -208,7 +210,7 @@ class MapQueueManager(ManagedNode):
         try:
             is_new = self._queue.add_submap(submap)
         except InvalidInputError as error:
-            self.complain(f"submap refused on {topic}: {error}")
+            self.complain(self._queue.in_words(f"submap refused on {topic}: {error}"))
             return
         self._missing.note(topic, submap.submap_id)
         if not is_new:
@@ -252,7 +254,7 @@ class MapQueueManager(ManagedNode):
         self._queue.is_growing = self._idle.is_active(now_s)
         for notice in self._queue.take_notices():
             self._message = notice
-            self.get_logger().warning(notice)
+            self.get_logger().warning(self._queue.in_words(notice))
         self._requests.look()
         # First saved, then told: what anybody has heard of outlives a kill.
         self._keeper.save_if_due(self._queue)

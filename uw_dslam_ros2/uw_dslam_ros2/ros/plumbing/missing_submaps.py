@@ -47,6 +47,8 @@ class MissingSubmaps:
         Hands a function to the thread that owns this object.
     on_submap
         Called with the topic and the message of each that was got.
+    in_words
+        Makes a sentence readable for people.
     """
 
     def __init__(
@@ -54,8 +56,10 @@ class MissingSubmaps:
         node: Node,
         post: Callable[[Callable[[], None]], None],
         on_submap: Callable[[str, SubmapMsg], None],
+        in_words: Callable[[str], str] = str,
     ) -> None:
         self._node, self._post, self._on_submap = node, post, on_submap
+        self._in_words = in_words
         self._group = ReentrantCallbackGroup()
         self._clients: dict[str, Client] = {}
         self._topics: dict[Track, str] = {}
@@ -87,6 +91,7 @@ class MissingSubmaps:
             if not self._ask(track, sequences) and waited_s >= _LOST_S:
                 lost.append(f"{track_name(track)}: {_ranges(sequences)}")
         text = f"submaps that never came and cannot be had: {'; '.join(lost)}" if lost else ""
+        text = self._in_words(text)
         if text and text != self.lost:
             self._node.get_logger().warning(text)
         self.lost = text

@@ -160,7 +160,7 @@ class QueueRequests:
         pair = f"{_names(request.source_ids)} to {_names(request.target_ids)}"
         message = f"{pair}: {result.verdict.name}: {result.reason}"
         self._owner.changed(message)
-        self._node.get_logger().info(message)
+        self._node.get_logger().info(self._owner.queue.in_words(message))
 
     def _correct(self, key: QueryKey, result: RegistrationResult) -> None:
         """Use the answer that all use, not the own one."""
