@@ -3,9 +3,12 @@
 import csv
 
 import numpy as np
+import pytest
 
+from uw_dslam_ros2.cli.studies import _map_methods
 from uw_dslam_ros2.cli.studies._map_methods import at_one_resolution
 from uw_dslam_ros2.cli.study import main
+from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -52,3 +55,9 @@ def test_walls_outlast_a_coarser_cell():
     assert (made.values[2, 1:10] == OCCUPIED).all()
     assert (np.delete(made.values, 2, axis=0)[:, :11] == FREE).all()
     assert (made.values[:, 11] == UNKNOWN).all()
+
+
+def test_a_method_that_is_not_installed_is_told(monkeypatch):
+    monkeypatch.setattr(_map_methods, "is_installed", lambda _: False)
+    with pytest.raises(ConfigError, match="kiss-matcher is not installed"):
+        _map_methods.compare([], ["kiss-matcher"])

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from uw_dslam_ros2.cli.studies._common import print_table, progress
+from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration import register_grids
 from uw_dslam_ros2.core.registration.baselines import (
@@ -18,6 +19,8 @@ from uw_dslam_ros2.core.registration.baselines import (
     hough_spectrum,
     orb_ransac,
 )
+from uw_dslam_ros2.core.registration.baselines.peers import is_installed, kiss_matcher
+from uw_dslam_ros2.core.registration.baselines.result import BaselineResult
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
@@ -27,10 +30,12 @@ from uw_dslam_ros2.sim.map_pairs import MapPair, is_right
 
 __all__ = ["MAP_METHODS", "add_method_arguments", "at_one_resolution", "compare"]
 
+_KISS = "kiss-matcher"
 MapMethod = Callable[[OccupancyMap, OccupancyMap], SE2 | None]
 """``T_target_source``, or None where the method refuses."""
 
 _WALL_PERCENT = 65
+_VOXEL_CELLS = 2.0
 
 
 def add_method_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +47,15 @@ def add_method_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def compare(pairs: Sequence[MapPair], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Ask every method about every pair, and print what became of them; rows for a CSV file."""
+    """Ask every method about every pair, and print what became of them; rows for a CSV file.
+
+    Raises
+    ------
+    ConfigError
+        For a method that is not installed.
+    """
+    if _KISS in names and not is_installed("kiss_matcher"):
+        raise ConfigError(f"method {_KISS} is not installed, expected: pip install kiss-matcher")
     rows: list[dict[str, Any]] = []
     for number, pair in enumerate(progress(pairs, text="methods")):
         for name in names:
@@ -120,6 +133,14 @@ def _without_proof(source: OccupancyMap, target: OccupancyMap) -> SE2 | None:
     return poses[0][1] if verdict is Verdict.ACCEPTED else None
 
 
+def _kiss(source: OccupancyMap, target: OccupancyMap) -> BaselineResult:
+    """KISS-Matcher on the walls, in voxels of two cells; its best of 1.5, 2 and 3."""
+    walls = (
+        one.spec.centers_of(np.argwhere(one.values >= _WALL_PERCENT)) for one in (source, target)
+    )
+    return kiss_matcher(*walls, voxel_m=_VOXEL_CELLS * source.spec.resolution_m)
+
+
 def _at_one(method: Callable[..., Any]) -> MapMethod:
     return lambda source, target: method(*at_one_resolution(source, target)).T_target_source
 
@@ -131,5 +152,8 @@ MAP_METHODS: dict[str, MapMethod] = {
     "akaze": _at_one(akaze_ransac),
     "hough": _at_one(hough_spectrum),
     "fourier-mellin": _at_one(fourier_mellin),
+    _KISS: _at_one(_kiss),
 }
-"""The engine, the engine without its certificate, and what map-merging packages use."""
+"""The engine, the engine without its certificate, what map-merging packages use, and a matcher of
+3-D scans that is no dependency.
+"""

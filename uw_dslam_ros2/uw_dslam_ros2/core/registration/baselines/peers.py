@@ -1,4 +1,4 @@
-"""Other packages' methods, where they are installed; the plane is lifted to z = 0.
+"""Other packages' methods, where they are installed; the plane is lifted to three dimensions.
 
 None of them is needed by this project: they are imported when called, and `available_peers`
 tells which can be. ``pip install open3d small-gicp kiss-matcher`` brings those that exist for the
@@ -18,9 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.registration.baselines.result import BaselineResult, checked_points
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["PEERS", "available_peers", "kiss_matcher", "open3d_icp", "small_gicp"]
+__all__ = ["PEERS", "available_peers", "is_installed", "kiss_matcher", "open3d_icp", "small_gicp"]
 
 FloatArray = NDArray[np.float64]
+_NUM_LAYERS = 5
+_LEAST_INLIERS = 5
 Matcher = Callable[[ArrayLike, ArrayLike], BaselineResult]
 
 
@@ -55,14 +57,26 @@ def small_gicp(
 
 
 def kiss_matcher(source: ArrayLike, target: ArrayLike, *, voxel_m: float = 0.05) -> BaselineResult:
-    """KISS-Matcher: features, pruning and GNC; it was made for dense 3-D scans."""
+    """KISS-Matcher: features, pruning and GNC, turning in the plane alone.
+
+    It was made for dense 3-D scans and looks at normals, so each point stands upright, a pole of
+    voxels half as high. Fewer inliers than its authors' examples ask for are a refusal.
+    """
     package = importlib.import_module("kiss_matcher")
-    matcher = package.KISSMatcher(package.KISSMatcherConfig(voxel_m))
-    found = matcher.estimate(_lifted("source", source), _lifted("target", target))
-    inliers = float(matcher.get_num_final_inliers())
+    config = package.KISSMatcherConfig(voxel_m)
+    config.use_quatro = True
+    matcher = package.KISSMatcher(config)
+    clouds = [
+        list(_upright(name, points, 0.5 * voxel_m).astype(np.float32))
+        for name, points in (("source", source), ("target", target))
+    ]
+    found = matcher.estimate(*clouds)
+    inliers = matcher.get_num_final_inliers()
+    if not found.valid or inliers < _LEAST_INLIERS:
+        return BaselineResult(None, float(inliers))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = found.rotation, np.ravel(found.translation)
-    return BaselineResult(_flattened(matrix) if found.valid else None, inliers)
+    return BaselineResult(_flattened(matrix), float(inliers))
 
 
 PEERS: dict[str, tuple[str, Matcher]] = {
@@ -75,16 +89,24 @@ PEERS: dict[str, tuple[str, Matcher]] = {
 
 def available_peers() -> dict[str, Matcher]:
     """Those of `PEERS` whose package is installed."""
-    return {
-        name: matcher
-        for name, (package, matcher) in PEERS.items()
-        if importlib.util.find_spec(package) is not None
-    }
+    return {name: matcher for name, (package, matcher) in PEERS.items() if is_installed(package)}
+
+
+def is_installed(package: str) -> bool:
+    """Whether a package can be imported."""
+    return importlib.util.find_spec(package) is not None
 
 
 def _lifted(name: str, points: ArrayLike) -> FloatArray:
     array = checked_points(name, points)
     return np.column_stack([array, np.zeros(len(array))])
+
+
+def _upright(name: str, points: ArrayLike, step_m: float) -> FloatArray:
+    """Points (N, 2) [m] as poles of `_NUM_LAYERS` points each."""
+    array = checked_points(name, points)
+    heights = np.repeat(np.arange(_NUM_LAYERS) * step_m, len(array))
+    return np.column_stack([np.tile(array, (_NUM_LAYERS, 1)), heights])
 
 
 def _flattened(matrix: ArrayLike) -> SE2 | None:
