@@ -55,7 +55,7 @@ def test_the_same_maps_told_otherwise_get_the_same_answer(place):
 @pytest.mark.parametrize("place", [p for p in _PAIRS if p[3]])
 def test_a_mirrored_map_is_never_accepted(place):
     kind, overlap, noise, _ = place
-    pair = make_pair(kind, overlap, noise, 7100, size_cells=160)
+    pair = make_pair(kind, overlap, noise, 7100, size_cells=120)
     assert _answer(replace(pair, source=mirrored(pair.source)))[0] is not Verdict.ACCEPTED
 
 

@@ -173,6 +173,8 @@ def test_every_line_of_the_table_can_decide(rng):
         evidence, config, proof = random_case(rng)
         if rng.random() < 0.01:
             evidence = replace(evidence, deviation_m=math.nan)
+        if rng.random() < 0.5:
+            evidence = replace(evidence, decoy=random_pose(rng))
         case = _Case(evidence, config, MODELS, proof)
         deciding.add(_RULES.index(first_that_applies(_RULES, case)))
     assert deciding == set(range(len(_RULES)))

@@ -7,14 +7,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uw_dslam_ros2.core.features.grid_filter import FilteredCells, clean_cells, coarsen
+from uw_dslam_ros2.core.features.grid_filter import (
+    FilteredCells,
+    clean_cells,
+    coarsen,
+    split,
+)
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.judging.agreement import WallMap
 from uw_dslam_ros2.core.registration.grids.problem import build_problem
 from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid
 
-__all__ = ["FINE_SIGMA_CELLS", "Sides", "prepare_maps"]
+__all__ = [
+    "FINE_SIGMA_CELLS",
+    "Sides",
+    "in_a_mirror",
+    "make_levels",
+    "on_cells_of",
+    "prepare_maps",
+]
 
 Sides = tuple[WallMap, WallMap]
 """Source and target on cells of one size."""
@@ -28,6 +40,8 @@ _SCANNED_PER_SPACING = 2.0
 # Maps that are bent agree on larger cells, up to where everything free would be near a wall.
 _NUM_SCALES = 4
 _LEAST_SPACING = 4.0  # cells, between walls and the middle of the free space
+# Where most of what is free is near a wall of large cells, only smaller ones tell where walls are.
+_ENOUGH_SPACING = 8.0  # cells
 _MOST_SCANNED, _MOST_FINEST = 4.0, 2.0  # times the cells asked for, of a map far larger
 
 
@@ -36,7 +50,7 @@ def prepare_maps(
 ) -> tuple[Pyramid, list[Sides]] | str:
     """Problems from coarse to fine, and both maps from fine to coarse; or what a map lacks.
 
-    The finest problem and the finest maps are on the same cells.
+    The finest problem is on the cells of one pair of the maps.
     """
     resolution_m = _finest_resolution(source, target, config.finest_cells)
     sides = []
@@ -46,11 +60,14 @@ def prepare_maps(
             return fault
         sides.append(coarsen(cells, resolution_m))
     finest = (WallMap(sides[0]), WallMap(sides[1]))
-    return _levels(*finest, config), _scales(finest)
+    return make_levels(*finest, config), _scales(finest)
 
 
 def _scales(finest: Sides) -> list[Sides]:
-    """Both maps on cells doubled each time, as long as walls stand apart from each other."""
+    """Both maps on cells doubled each time, as long as walls stand apart from each other.
+
+    And first on cells half as large as the finest, where walls stand close on those.
+    """
     spacing = min(_wall_spacing(walls) for walls in finest)
     scales = [finest]
     while len(scales) < _NUM_SCALES and 2 ** len(scales) * _LEAST_SPACING <= spacing < math.inf:
@@ -58,7 +75,24 @@ def _scales(finest: Sides) -> list[Sides]:
             coarsen(walls.cells, walls.cells.resolution_m * 2.0 ** len(scales)) for walls in finest
         ]
         scales.append((WallMap(cells[0]), WallMap(cells[1])))
+    if spacing < _ENOUGH_SPACING:
+        scales.insert(0, (WallMap(split(finest[0].cells)), WallMap(split(finest[1].cells))))
     return scales
+
+
+def on_cells_of(scales: Sequence[Sides], resolution_m: float) -> Sides:
+    """Both maps on cells of that size, one of those that there are."""
+    return next(sides for sides in scales if sides[0].cells.resolution_m == resolution_m)
+
+
+def in_a_mirror(walls: WallMap) -> WallMap:
+    """A map with left and right exchanged."""
+    cells = walls.cells
+    wall, free, known, row, col = (
+        np.ascontiguousarray(values[:, ::-1])
+        for values in (cells.wall, cells.free, cells.known, cells.row, cells.col)
+    )
+    return WallMap(FilteredCells(cells.resolution_m, wall, free, known, row, wall.shape[1] - col))
 
 
 def _finest_resolution(source: OccupancyMap, target: OccupancyMap, num_cells: int) -> float:
@@ -81,7 +115,7 @@ def _cell_size(sides: Sequence[float], num_cells: int, most: float) -> int:
     return max(1, math.ceil(size - 1e-9))
 
 
-def _levels(source: WallMap, target: WallMap, config: GridRegistrationConfig) -> Pyramid:
+def make_levels(source: WallMap, target: WallMap, config: GridRegistrationConfig) -> Pyramid:
     """Problems whose cells are halved from those of the scan to the finest."""
     sides = sorted(max(walls.cells.shape) for walls in (source, target))
     num_cells = config.working_cells

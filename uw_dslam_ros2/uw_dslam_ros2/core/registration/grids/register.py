@@ -17,6 +17,7 @@ from uw_dslam_ros2.core.registration.grids.finding.candidates import merge_best,
 from uw_dslam_ros2.core.registration.grids.finding.frames import GridFrames
 from uw_dslam_ros2.core.registration.grids.finding.search import search_poses
 from uw_dslam_ros2.core.registration.grids.judging.evidence import Found, weigh
+from uw_dslam_ros2.core.registration.grids.judging.mirror import add_mirror_image
 from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MatchEvidence,
     PoseEvidence,
@@ -25,7 +26,7 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
 from uw_dslam_ros2.core.registration.grids.judging.symmetry import add_symmetric_rivals
 from uw_dslam_ros2.core.registration.grids.judging.verdict import Proof, decide
 from uw_dslam_ros2.core.registration.grids.paper import register_grids_by_points
-from uw_dslam_ros2.core.registration.grids.preparation import prepare_maps
+from uw_dslam_ros2.core.registration.grids.preparation import Sides, prepare_maps
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid
 from uw_dslam_ros2.core.registration.result import (
@@ -45,7 +46,7 @@ Clock = Callable[[], float]
 
 _NUM_BOXES_OF_REFUSED = 20_000
 _RIVAL_SHARE = 0.5
-_LOOK_FOR_TWINS = 0.5
+_LOOK_FOR_DOUBTS = 0.5
 _SAME_SCORE = 1e-6
 
 
@@ -168,7 +169,7 @@ class _GridMatch:
             # Where the proof is open, the poses that it could not exclude are rivals like others.
             candidates = merge_best(searched, candidates, outcome)
             found = weigh(scales, pyramid, window, candidates, background)
-        return self._answer(pyramid, outcome, _with_symmetric_rivals(found, pyramid, window))
+        return self._answer(pyramid, outcome, self._doubted(found, scales, pyramid, window))
 
     def collect(self) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
         """Evidence, and that of each pose by itself; None where a map holds too little."""
@@ -180,8 +181,22 @@ class _GridMatch:
         found = weigh(scales, pyramid, window, *scan_candidates(pyramid, window))
         weighed = (found.evidence.best, *found.evidence.rivals)
         motions = [self._frames.to_frames(pyramid.finest.motion_of(c.pose)) for c in found.refined]
-        evidence = _with_symmetric_rivals(found, pyramid, window).evidence
+        evidence = self._doubted(found, scales, pyramid, window).evidence
         return evidence, list(zip(weighed, motions, strict=True))
+
+    def _doubted(
+        self, found: Found, scales: list[Sides], pyramid: Pyramid, window: PoseWindow
+    ) -> Found:
+        """With what explains the match otherwise: symmetries of a map, and a mirror.
+
+        They only matter to a match that would be convincing without them. Inside a prior window
+        nothing is asked of a mirror, which would move the window.
+        """
+        if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_DOUBTS:
+            return found
+        if self._prior is None:
+            found = add_mirror_image(found, scales, pyramid, self._config)
+        return add_symmetric_rivals(found, pyramid, window)
 
     def _certify(
         self,
@@ -267,10 +282,3 @@ class _GridMatch:
 
     def _refused(self, verdict: Verdict, reason: str) -> RegistrationResult:
         return RegistrationResult.refused(verdict, reason, seconds=self._elapsed())
-
-
-def _with_symmetric_rivals(found: Found, pyramid: Pyramid, window: PoseWindow) -> Found:
-    """Symmetries only matter to a match that would be convincing without them."""
-    if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_TWINS:
-        return found
-    return add_symmetric_rivals(found, pyramid, window)

@@ -21,7 +21,11 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
     PoseEvidence,
     pose_logit,
 )
-from uw_dslam_ros2.core.registration.grids.preparation import FINE_SIGMA_CELLS, Sides
+from uw_dslam_ros2.core.registration.grids.preparation import (
+    FINE_SIGMA_CELLS,
+    Sides,
+    on_cells_of,
+)
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, PoseWindow
 from uw_dslam_ros2.core.registration.grids.pyramid import Pyramid, carried
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
@@ -96,7 +100,7 @@ def weigh(
     best, _ = weighed[0]
     apart = [p for p in weighed[1:] if not is_same_pose(finest, p[0].pose, best.pose)]
     kept, poses = zip(weighed[0], *apart, strict=True)
-    sides = scales[0]
+    sides = on_cells_of(scales, finest.resolution_m)
     spread = pose_spread(finest, best.pose, FINE_SIGMA_CELLS, (sides[0].seen, sides[1].seen))
     evidence = MatchEvidence(
         best=poses[0],

@@ -19,6 +19,7 @@ __all__ = [
     "MatchEvidence",
     "PoseEvidence",
     "VerdictModels",
+    "lead_over_decoy",
     "match_features",
     "pose_features",
     "pose_logit",
@@ -48,7 +49,8 @@ class MatchEvidence:
     at the rim for turns; ``extent_m`` the root mean square distance of the walls of the smaller
     map from their mean. ``log_volume`` is the logarithm of the number of poses that were searched:
     the more there are, the better the best of them is by chance. ``cell_m`` is the side of the
-    cells on which the maps agree best, and which all of this is counted in.
+    cells on which the maps agree best, and which all of this is counted in. ``decoy`` is the best
+    pose of the source seen in a mirror, on the same cells, where that was looked for.
     """
 
     best: PoseEvidence
@@ -57,6 +59,7 @@ class MatchEvidence:
     extent_m: float
     log_volume: float
     cell_m: float
+    decoy: PoseEvidence | None = None
 
     @property
     def rival_share(self) -> float:
@@ -178,6 +181,16 @@ def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MO
 def rival_probability(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
     """How probable the most convincing rival is for itself, as if the best pose were not there."""
     return _share(_most_alike(evidence, models.pose))
+
+
+def lead_over_decoy(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
+    """By how much the logit of the best pose exceeds that of the decoy; infinite without one."""
+    if evidence.decoy is None:
+        return math.inf
+    best, decoy = (
+        pose_logit(pose, evidence.log_volume, models) for pose in (evidence.best, evidence.decoy)
+    )
+    return best - decoy
 
 
 def _share(logit: float) -> float:

@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MODELS,
     MatchEvidence,
     VerdictModels,
+    lead_over_decoy,
     probability_of,
     rival_probability,
 )
@@ -27,6 +28,8 @@ MOST_RIVAL_PROBABILITY = 0.8
 """A rival that by itself is more probable than that makes a match ambiguous."""
 _LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
 _LOOSE_SHARE = 0.1  # of the walls' extent: less sure along its weakest direction is worth saying
+_DECOY_MARGIN = 1.5  # of logits: noise decides on less, in a place that is its own mirror image
+_LEAST_DETAIL = 1.0  # cells: with less, nothing that agrees is off a few straight lines
 _DOUBTED = 0.5  # most probability left to a pose that the maps do not tell from others
 
 
@@ -93,6 +96,16 @@ class _Case:
         richer = replace(self.evidence, best=replace(best, agreement=detailed))
         is_like = agreement.agreement >= _LIKE_SHARE
         return is_like and probability_of(richer, self.models) >= self.least
+
+    @property
+    def lead(self) -> float:
+        """By how much more the best pose convinces than that of the source in a mirror."""
+        return lead_over_decoy(self.evidence, self.models)
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether nothing agrees but straight walls."""
+        return self.agreement.num_detail < _LEAST_DETAIL
 
     @property
     def improbable(self) -> str:
@@ -176,6 +189,24 @@ _RULES: tuple[Rule[_Case, Verdict], ...] = (
         most_probability=_DOUBTED,
     ),
     Rule(
+        lambda c: c.is_probable and c.lead < -_DECOY_MARGIN,
+        Verdict.AMBIGUOUS,
+        lambda c: (
+            "in a mirror the source agrees better than as it is, by odds of "
+            f"{math.exp(-c.lead):.1f}: one of the maps may have left and right exchanged"
+        ),
+        most_probability=_DOUBTED,
+    ),
+    Rule(
+        lambda c: c.is_probable and c.is_bare and c.lead < _DECOY_MARGIN,
+        Verdict.AMBIGUOUS,
+        lambda c: (
+            "nothing but straight walls agrees, and in a mirror, where no pose is right, they "
+            f"agree about as well; {c.measured}"
+        ),
+        most_probability=_DOUBTED,
+    ),
+    Rule(
         lambda c: not c.is_probable and c.is_plain,
         Verdict.AMBIGUOUS,
         lambda c: (
@@ -243,7 +274,10 @@ def _not_finite(evidence: MatchEvidence, proof: Proof) -> Iterator[str]:
         ("the lower bound", proof.lower_bound),
         ("the upper bound", proof.upper_bound),
     ]
-    for whose, pose in (("", evidence.best), *((" of a rival", r) for r in evidence.rivals)):
+    poses = [("", evidence.best), *((" of a rival", r) for r in evidence.rivals)]
+    if evidence.decoy is not None:
+        poses.append((" in a mirror", evidence.decoy))
+    for whose, pose in poses:
         numbers += [(f"the score{whose}", pose.score), (f"the surprise{whose}", pose.surprise)]
         for field in dataclasses.fields(pose.agreement):
             numbers.append((f"{field.name}{whose}", getattr(pose.agreement, field.name)))

@@ -1,0 +1,100 @@
+"""A source seen in a mirror, where no pose is right, tells what two maps reach by chance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grids.judging.agreement import WallMap
+from uw_dslam_ros2.core.registration.grids.judging.probability import (
+    lead_over_decoy,
+    probability_of,
+)
+from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
+from uw_dslam_ros2.core.registration.grids.preparation import in_a_mirror, prepare_maps
+from uw_dslam_ros2.core.registration.grids.register import match_evidence, register_grids
+from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.sim.map_pairs import make_pair
+from uw_dslam_ros2.sim.map_variants import mirrored
+
+_CONFIG = GridRegistrationConfig()
+
+
+@pytest.fixture(scope="module")
+def lake():
+    """A shore that agrees by 98 % with itself in a mirror, as far as the two overlap."""
+    return make_pair("lake", 0.7, "noisy", 7100, size_cells=120)
+
+
+def test_a_map_in_a_mirror_is_the_map_that_is_made_of_it(lake):
+    _, scales = prepare_maps(lake.source, lake.target, _CONFIG)
+    _, made = prepare_maps(mirrored(lake.source), lake.target, _CONFIG)
+    seen, expected = in_a_mirror(scales[0][0]), made[0][0]
+    assert isinstance(seen, WallMap)
+    for name in ("wall", "free", "known", "row", "col"):
+        np.testing.assert_allclose(getattr(seen.cells, name), getattr(expected.cells, name))
+    np.testing.assert_array_equal(seen.distance, expected.distance)
+
+
+def test_a_lake_in_a_mirror_is_ambiguous(lake):
+    evidence, _ = match_evidence(mirrored(lake.source), lake.target)
+    assert probability_of(evidence) > 0.8  # of the poses as they are, convincing
+    assert lead_over_decoy(evidence) < -1.0
+    verdict, reason, probability = decide(evidence, _CONFIG)
+    assert verdict is Verdict.AMBIGUOUS
+    assert "in a mirror" in reason
+    assert probability <= 0.5
+    result = register_grids(mirrored(lake.source), lake.target)
+    assert (result.verdict, result.reason) == (verdict, reason)
+
+
+def test_what_agrees_better_in_a_mirror_is_ambiguous(lake):
+    evidence, _ = match_evidence(lake.source, lake.target)
+    agreement = replace(evidence.best.agreement, agreement=0.9, num_detail=2.0)
+    worse = replace(evidence.best, agreement=agreement)
+    exchanged = replace(evidence, best=worse, decoy=evidence.best, rivals=())
+    assert probability_of(exchanged) > 0.75
+    assert lead_over_decoy(exchanged) < 0.0
+    assert decide(exchanged, _CONFIG)[0] is Verdict.ACCEPTED  # noise, as far as this goes
+    worse = replace(worse, surprise=0.5 * worse.surprise)
+    verdict, reason, _ = decide(replace(exchanged, best=worse), _CONFIG)
+    assert verdict is Verdict.AMBIGUOUS
+    assert "left and right exchanged" in reason
+
+
+def test_the_right_match_leads_its_mirror_image(lake):
+    evidence, _ = match_evidence(lake.source, lake.target)
+    assert lead_over_decoy(evidence) > 1.5
+    assert decide(evidence, _CONFIG)[0] is Verdict.ACCEPTED
+
+
+def test_straight_walls_that_agree_as_well_in_a_mirror_are_no_proof(lake):
+    evidence, _ = match_evidence(lake.source, lake.target)
+    agreement = replace(evidence.best.agreement, num_detail=0.0)
+    bare = replace(evidence.best, agreement=agreement)
+    alike = replace(evidence, best=bare, decoy=bare, rivals=())
+    assert probability_of(alike) > 0.75
+    verdict, reason, probability = decide(alike, _CONFIG)
+    assert verdict is Verdict.AMBIGUOUS
+    assert "nothing but straight walls agrees" in reason
+    assert probability <= 0.5
+    detailed = replace(evidence, decoy=evidence.best, rivals=())  # a place like its mirror image
+    assert decide(detailed, _CONFIG)[0] is Verdict.ACCEPTED
+    assert lead_over_decoy(detailed) == pytest.approx(0.0)
+
+
+def test_a_decoy_that_is_no_number_decides_nothing(lake):
+    evidence, _ = match_evidence(lake.source, lake.target)
+    bad = replace(evidence, decoy=replace(evidence.best, surprise=float("nan")))
+    verdict, reason, _ = decide(bad, _CONFIG)
+    assert verdict is Verdict.TOO_FEW_FEATURES
+    assert "the surprise in a mirror is nan" in reason
+
+
+def test_nothing_is_asked_of_a_mirror_inside_a_prior_window(lake):
+    prior = PriorWindow(lake.T_target_source or SE2(), 2.0, 0.3)
+    evidence, _ = match_evidence(lake.source, lake.target, prior=prior)
+    assert evidence.decoy is None
+    assert lead_over_decoy(evidence) == float("inf")
