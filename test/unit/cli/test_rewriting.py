@@ -75,6 +75,15 @@ def test_what_the_recordings_told_is_kept_and_scores_are_not(result):
     assert not [name for name in result[1] if "anew" in name], "nothing is left lying about"
 
 
+def test_what_was_left_by_one_that_was_killed_goes(result, tmp_path):
+    (tmp_path / "report.json").write_bytes(result[0]["report.json"])
+    (tmp_path / ".anew-killed").mkdir()
+    (tmp_path / ".anew-killed" / "report.json").write_text("half")
+    write_anew(tmp_path, missions.settled_queue())
+    assert not list(tmp_path.glob(".anew-*"))
+    assert not (tmp_path / "report.html").exists(), "it had no pictures"
+
+
 def test_a_folder_without_a_report_is_left_alone(tmp_path):
     assert not has_report(tmp_path)
     with pytest.raises(DataError, match=r"report.json is no report"):

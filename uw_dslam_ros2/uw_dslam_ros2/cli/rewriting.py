@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ _NOTE = (
     "written anew from the submaps after people decided something; offline with --decisions draws "
     "the chart of it from the recordings, and scores it"
 )
+_BEGINNING = ".anew-"
 _OF_TRUTH = "map_against_truth.png", "trajectory_error.png"
 
 
@@ -32,7 +34,8 @@ def has_report(folder: Path) -> bool:
 def write_anew(folder: Path, queue: MapQueue) -> None:
     """Replace a result's maps, trajectories, pose graph, report and pictures.
 
-    All is made first, and then put in place file by file, the report last. What the recordings
+    All is made first, and then put in place file by file, the report last; whoever holds the
+    session is the only one who does so. What the recordings
     and the truth alone tell is kept (settings, findings) or left out (scores, errors).
 
     Raises
@@ -50,7 +53,9 @@ def write_anew(folder: Path, queue: MapQueue) -> None:
     unmapped = tuple(told.get("vehicles_not_mapped", ()))
     outcome = dataclasses.replace(outcome_of(queue), unmapped=unmapped)
     try:
-        with tempfile.TemporaryDirectory(prefix=".anew-", dir=folder) as made:
+        for left in folder.glob(f"{_BEGINNING}*"):  # by one that was killed
+            shutil.rmtree(left)
+        with tempfile.TemporaryDirectory(prefix=_BEGINNING, dir=folder) as made:
             has_pictures = (folder / "report.html").is_file()
             write_report(Path(made), outcome, facts, None, has_pictures=has_pictures)
             _put_in_place(Path(made), folder)

@@ -18,7 +18,7 @@ from uw_dslam_ros2.view.showing import Showing
 
 __all__ = ["QueueSource"]
 
-_WRITTEN_WITHIN_S = 30.0
+_WRITTEN_WITHIN_S = 120.0
 
 
 class QueueSource:
