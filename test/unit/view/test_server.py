@@ -61,6 +61,13 @@ def test_the_scene_holds_vehicles_submaps_and_matches(source):
     assert status == 304
 
 
+@pytest.mark.parametrize("accepted", ["identity", "gzip, deflate, br"])
+def test_the_scene_is_packed_for_whom_unpacks_it(source, accepted):
+    ((_, headers, body),) = answers(source, ["/api/scene"], headers={"Accept-Encoding": accepted})
+    assert headers.get("Content-Encoding", "identity") == accepted.split(",")[0]
+    assert json.loads(body)["title"] == "a harbour"
+
+
 def test_runs_are_counted_and_not_told_by_their_random_numbers():
     queue = MapQueue()
     for run_id, stamp_ns in ((3_000_000_000, 5), (7, 9)):

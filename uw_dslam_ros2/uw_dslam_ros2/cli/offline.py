@@ -138,13 +138,13 @@ def _run(args: argparse.Namespace) -> int:
             queue.add_submap(submap)
     for decision in decisions:
         queue.decide(decision)
-    if args.fixes is not None:
-        events = {made.vehicle_id: made.fixes for made in mapped}
-        submaps = [submap for made in mapped for submap in made.submaps]
-        queue.add_fixes(fixes_of_recordings(events, submaps, args.fixes))
     say(f"merging {len(queue.submaps())} submaps")
     with progress_bar("registering", " pairs") as progress:
         settle(queue, config.registration, progress)
+    if args.fixes is not None:  # nothing that is asked depends on them
+        events = {made.vehicle_id: made.fixes for made in mapped}
+        submaps = [submap for made in mapped for submap in made.submaps]
+        queue.add_fixes(fixes_of_recordings(events, submaps, args.fixes))
     merged_s = time.monotonic()
 
     outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))

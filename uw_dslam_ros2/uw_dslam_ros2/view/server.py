@@ -231,22 +231,22 @@ class ViewServer:
             return web.Response(status=404, text=f"there is no {name}")
 
     async def _scene(self, request: web.Request) -> web.StreamResponse:
+        is_small = "gzip" in request.headers.get("Accept-Encoding", "")
+
         def work() -> tuple[str, bytes]:
             showing = self._source.showing()
             scene = {"title": self._source.title, **showing.scene()}
+            body = json.dumps(scene, allow_nan=False).encode()
             # A quick compression: the page is near, and all of this changes often.
-            return showing.version, gzip.compress(json.dumps(scene, allow_nan=False).encode(), 1)
+            return showing.version, gzip.compress(body, 1) if is_small else body
 
         version, body = await self._in_thread(work)
-        tag = f'"{version}"'
-        if request.headers.get("If-None-Match") == tag:
-            return web.Response(status=304, headers={"ETag": tag})
-        response = web.Response(
-            body=body,
-            content_type="application/json",
-            headers={"ETag": tag, "Cache-Control": "no-cache", "Content-Encoding": "gzip"},
-        )
-        return response
+        headers = {"ETag": f'"{version}"', "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
+        if request.headers.get("If-None-Match") == headers["ETag"]:
+            return web.Response(status=304, headers=headers)
+        if is_small:
+            headers["Content-Encoding"] = "gzip"
+        return web.Response(body=body, content_type="application/json", headers=headers)
 
     async def _status(self, _request: web.Request) -> web.StreamResponse:
         return web.json_response(await self._in_thread(self._source.status))
