@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -46,6 +47,31 @@ def bag(tmp_path_factory):
             )
             writer.write("/auv_1/dvl", stamp_ns, message)
     return path
+
+
+def test_bad_messages_are_counted_among_those_that_were_looked_at(tmp_path, capsys):
+    with BagWriter(tmp_path / "auv_1") as writer:
+        make = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
+        writer.add_topic("/auv_1/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+        for k in range(4000):
+            stamp_ns = 1000 * SECOND + k * SECOND // 10
+            writer.write("/auv_1/imu", stamp_ns, make.imu(stamp_ns, "", 0.01 * k, 0.0, 0.1, 1e-6))
+            image = SonarImage(
+                stamp_ns,
+                np.zeros((4, 3), np.uint8),
+                np.arange(1.0, 5.0),
+                np.array([0.3, 0.0, -0.3]),
+            )
+            message = make.sonar_image("", image)
+            message.ranges = np.full(4, np.nan, np.float32)
+            writer.write("/auv_1/sonar", stamp_ns, message)
+    assert main([str(tmp_path / "auv_1"), "--out", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    (line,) = (text for text in out.splitlines() if "malformed" in text)
+    num_bad, num_read = re.search(r"(\d+) of (\d+) messages are malformed", line).groups()
+    assert num_bad == num_read
+    assert int(num_read) < 200
 
 
 def test_what_is_wrong_is_told_and_mended(bag, tmp_path, capsys):

@@ -199,15 +199,18 @@ class _Messages:
     def __init__(self) -> None:
         self.findings: list[Finding] = []
         self._counts: dict[str, SensorCount] = {}
+        self._num_read: dict[str, int] = {}
 
     def note(self, reader: VehicleReader) -> None:
-        """Take what a pass found; a role that was passed over counts no message as empty."""
+        """Take what a pass found; bad messages are counted among those that were looked at."""
         self.findings += [finding for finding in reader.findings if finding not in self.findings]
         for role, count in reader.counts.items():
             known = self._counts.get(role, SensorCount(0))
+            num_bad = known.num_bad + count.num_bad
+            self._num_read[role] = self._num_read.get(role, 0) + count.num_read
             self._counts[role] = SensorCount(
-                count.num,
-                max(count.num_bad, known.num_bad),
+                self._num_read[role] if num_bad else count.num,
+                num_bad,
                 max(count.num_empty, known.num_empty),
                 known.problem or count.problem,
             )

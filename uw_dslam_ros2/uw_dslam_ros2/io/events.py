@@ -114,9 +114,13 @@ def read_events(
 
 @dataclass(slots=True)
 class MessageCount:
-    """What became of a sensor's messages; `problem` is that of the first bad one."""
+    """What became of a sensor's messages; `problem` is that of the first bad one.
+
+    `num_read` are those of `num` that were wanted.
+    """
 
     num: int = 0
+    num_read: int = 0
     num_bad: int = 0
     num_empty: int = 0
     num_repeated: int = 0
@@ -232,6 +236,7 @@ class VehicleReader:
             stamp_ns = int(self.stamps[role][position]) if role in self.stamps else None
             if is_wanted is not None and not is_wanted(role, stamp_ns):
                 continue
+            count.num_read += 1
             try:
                 found = self._read(self._readers[index], raw, role, stamp_ns)
             except (InvalidInputError, DataError, ValueError, TypeError, OverflowError) as error:
