@@ -8,6 +8,7 @@ import pytest
 from unit.doctor.made_up_vehicle import vehicle
 
 from uw_dslam_ros2.core.doctor import PingSample, examine
+from uw_dslam_ros2.core.doctor.imu import compare_yaw_and_rate
 
 SEEDS = (1, 2)
 
@@ -195,6 +196,18 @@ def test_stops_of_commanded_velocities_are_no_lost_lock():
     assert examine(commanded, nothing).findings == []
     measured = replace(navigation, velocity_m_s=np.where(stops, 0.0, navigation.velocity_m_s))
     assert [f.kind for f in examine(measured, nothing).findings] == ["dvl_zero_without_lock"]
+
+
+@pytest.mark.parametrize("largest_rad", [0.35, 0.4, 0.45, 0.49, 0.51])
+def test_a_heading_in_time_is_not_late_however_little_it_turns(largest_rad):
+    t = np.arange(0.0, 45.0, 0.04)
+    yaw = 0.3 * np.sin(0.2 * t) + np.where(t > 40.0, 0.06 * (t - 40.0) ** 2, 0.0)
+    first, last = slice(50, 1037), slice(88, 1075)  # spans of 1.5 s that a delay of 2 s leaves
+    yaw *= largest_rad / np.ptp(yaw[last] - yaw[first])
+    noise = np.random.default_rng(1).normal(0.0, 0.005, (2, len(t)))
+    rate = np.gradient(yaw, t)
+    state = compare_yaw_and_rate(t, yaw + noise[0], rate + noise[1])
+    assert state.orientation_delay_s == 0.0
 
 
 def test_a_gap_of_the_imu_is_no_swing_of_its_heading():

@@ -86,10 +86,12 @@ def _delay(imu_s: FloatArray, yaw: FloatArray, rates: FloatArray) -> float:
         known = np.isfinite(by_yaw) & np.isfinite(by_rates)
         if known.sum() < 20 or min(np.ptp(by_yaw[known]), np.ptp(by_rates[known])) == 0.0:
             return 1.0
-        if np.ptp(by_yaw[known]) < _MIN_TURN_RAD:
-            return 1.0
         return 1.0 - abs(float(np.corrcoef(by_yaw[known], by_rates[known])[0, 1]))
 
+    now = at_times(begin + _WINDOW_S, imu_s, yaw) - at_times(begin, imu_s, yaw)
+    now = now[np.isfinite(now)]
+    if len(now) < 2 or np.ptp(now) < _MIN_TURN_RAD:
+        return 0.0
     delays = np.arange(-_MAX_DELAY_S, _MAX_DELAY_S + 1e-9, 0.05)
     costs = np.array([unlike(float(delay_s)) for delay_s in delays])
     best = int(np.argmin(costs))
