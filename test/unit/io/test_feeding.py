@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from uw_dslam_ros2.core.mapping import OccupancyConfig, VehicleMapper, VehicleMapperConfig
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.sonar import SonarConfig
+from uw_dslam_ros2.core.sonar import SonarConfig, SonarImage
 from uw_dslam_ros2.io.feeding import feed, in_stamp_order
 from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.readings import (
+    ImageEvent,
     ImuEvent,
     PointsEvent,
     PoseEvent,
@@ -200,6 +201,23 @@ def test_a_sonar_that_points_down_is_told(pitch_deg, is_told):
     mountings.add(TransformEvent("auv_1", 0, "auv_1/base_link", "auv_1/sonar", matrix))
     mountings.of(ScanEvent("auv_1", 0, "auv_1/sonar", BEARINGS, BEARINGS + 3.0, 9.0))
     assert bool(mountings.tilted) is is_told
+
+
+def test_what_names_no_frame_is_taken_to_look_ahead():
+    mountings = Mountings("auv_1/base_link")
+    image = SonarImage(
+        0, np.zeros((3, 2), np.uint8), np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.0])
+    )
+    for frame_id in ("", "/", "auv_1/base_link"):
+        np.testing.assert_array_equal(
+            mountings.of(ImageEvent("auv_1", 0, frame_id, image))[:3, 2], [1.0, 0.0, 0.0]
+        )
+    down = VelocityEvent("auv_1", 0, "", np.zeros(3), None, is_z_down=True)
+    np.testing.assert_array_equal(np.diag(mountings.of(down)), [1.0, -1.0, -1.0, 1.0])
+    assert not mountings.tilted
+    (finding, _) = mountings.findings("auv_1")
+    assert (finding.kind, finding.role) == ("no_mounting", "sonar")
+    assert "name no frame" in finding.detail
 
 
 def test_the_vehicles_own_odometry_moves_it_whatever_its_frame():

@@ -91,8 +91,14 @@ class Mountings:
         return self._known[key]
 
     def _mounting(self, event: Reading, frame_id: str) -> FloatArray:
+        if not frame_id.strip("/"):
+            if role_of(event) == "sonar":  # of others the place counts little
+                self.unknown[frame_id] = role_of(event)
+            return usual_mounting(event)
         if self._is_base(frame_id):
-            return np.eye(4)
+            # A frame whose z is ahead is not the body's: its name was taken for the vehicle's.
+            is_z_ahead = isinstance(event, ImageEvent) and event.forward == "z"
+            return usual_mounting(event) if is_z_ahead else np.eye(4)
         try:
             return self._frames.lookup(self._base_frame_id, frame_id)
         except InvalidInputError:
@@ -109,8 +115,12 @@ class Mountings:
             Finding(
                 "no_mounting",
                 "velocity" if word == "dvl" else word,
-                f"no transform says where its frame {frame_id!r} sits; it is taken to sit "
-                "at the origin, level and looking ahead",
+                (
+                    f"no transform says where its frame {frame_id!r} sits"
+                    if frame_id
+                    else "its messages name no frame (header.frame_id)"
+                )
+                + "; it is taken to sit at the origin, level and looking ahead",
                 vehicle_id=vehicle_id,
             )
             for frame_id, word in sorted(self.unknown.items())
