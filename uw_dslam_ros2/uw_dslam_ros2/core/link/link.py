@@ -14,10 +14,8 @@ from uw_dslam_ros2.core.link.coding.codec import (
     Layer,
     LayeredSubmap,
     encode_submap,
-    read_outline,
     write_outline,
 )
-from uw_dslam_ros2.core.link.coding.fields import ByteReader
 from uw_dslam_ros2.core.link.coding.items import (
     ItemKind,
     LayerKey,
@@ -30,6 +28,8 @@ from uw_dslam_ros2.core.link.coding.items import (
     read_layer,
     read_note,
 )
+from uw_dslam_ros2.core.link.held import HeldSubmaps
+from uw_dslam_ros2.core.link.reporting import Reporting, fitted
 from uw_dslam_ros2.core.link.transport.inbox import Inbox
 from uw_dslam_ros2.core.link.transport.outbox import Outbox, OutItem
 from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES, Packet, bundled, unbundled
@@ -45,9 +45,6 @@ _LAYER_RANKS = {
     Layer.FINE: 2.0,
 }
 """The lower, the sooner."""
-_PACKETS_PER_STATUS = 12  # between two reports while there is something else to send
-_HASTE = 0.3  # who has nothing else to say reports that much sooner
-_MAX_UNANSWERED = 10
 
 
 class AcousticLink:
@@ -72,15 +69,10 @@ class AcousticLink:
         self._sources: dict[tuple[int, int], Submap] = {}
         self._inboxes: dict[int, Inbox] = {}
         self._items: dict[int, dict[int, bytes]] = {}
-        self._names: dict[int, str] = {config.number: name}
-        self._held: dict[tuple[int, int, int], LayeredSubmap] = {}
-        self._waiting: dict[tuple[int, LayerKey], bytes] = {}  # finer layers that came too early
-        self._given: dict[tuple[int, int, int], int] = {}  # revision of the submap given out
+        self._held = HeldSubmaps(config.number, name, self._key)
         self._answers: list[bytes] = []
         self._heard_s: dict[int, float] = {}
-        self._news, self._last_status_s, self._num_reports = 0, -1e9, 0
-        self._num_unanswered = 0  # reports since there was anything new
-        self._num_since_status = _PACKETS_PER_STATUS
+        self._reporting = Reporting(config)
         self._outbox.add(hello_item(name), _OUTLINE_RANK, "hello")
 
     # --- own submaps -------------------------------------------------------------------------
@@ -96,19 +88,18 @@ class AcousticLink:
         for layer, data in layers.items():
             self._say(LayerKey.of(submap.run_id, submap.sequence, layer), data)
         self._rank_cells()
-        return self._improved(self._config.number)
+        return self._held.improved(self._config.number)
 
     def own_submap(self, submap_id: SubmapId) -> Submap | None:
         """A submap of this vehicle: as it came or, after a restart, as the others have it."""
-        run = submap_id.run_id & 0xFFFF
-        source = self._sources.get((run, submap_id.sequence))
-        held = self._held.get((self._config.number, run, submap_id.sequence))
+        key = LayerKey.of(submap_id.run_id, submap_id.sequence, Layer.OUTLINE)
+        source, held = self._sources.get((key.run, key.sequence)), self._held.own(key)
         return source or (None if held is None else held.submap(self._name))
 
     def move_submap(self, submap: Submap) -> list[Submap]:
         """Take a new pose of an own submap, whose cells are as before; as `add_submap`."""
-        run = submap.run_id & 0xFFFF
-        held = self._held.get((self._config.number, run, submap.sequence))
+        key = LayerKey.of(submap.run_id, submap.sequence, Layer.OUTLINE)
+        held = self._held.own(key)
         if held is None or held.outline is None:
             raise InvalidInputError(f"submap {submap.submap_id} moves before it has come")
         outline = dataclasses.replace(
@@ -118,9 +109,8 @@ class AcousticLink:
             T_odom_submap=submap.T_odom_submap,
             covariance=submap.covariance,
         )
-        key = LayerKey.of(submap.run_id, submap.sequence, Layer.OUTLINE)
         self._say(key, write_outline(outline, self._key))
-        return self._improved(self._config.number)
+        return self._held.improved(self._config.number)
 
     def add_answer(self, answer: bytes) -> None:
         """Tell the others the answer to a question; see `answers`.
@@ -142,19 +132,15 @@ class AcousticLink:
 
     def outlines(self) -> dict[tuple[int, int, int], LayeredSubmap]:
         """What is known of all submaps, by sender, run (16 bits) and sequence."""
-        return dict(self._held)
+        return dict(self._held.submaps)
 
     def name_of(self, sender: int) -> str | None:
         """The vehicle with that number; None while it is not known."""
-        return self._names.get(sender)
-
-    def number_of(self, vehicle_id: str) -> int | None:
-        """The number of a vehicle; None while it is not known."""
-        return next((n for n, name in self._names.items() if name == vehicle_id), None)
+        return self._held.names.get(sender)
 
     def _say(self, key: LayerKey, data: bytes) -> None:
         item, content = self._own.get(key), layer_item(key, data)
-        self._take_layer(self._config.number, key, data)
+        self._held.take_layer(self._config.number, key, data)
         if item is None:
             added = self._outbox.add(content, _LAYER_RANKS[key.layer], key.layer.name.lower())
             self._own[key] = added
@@ -165,12 +151,12 @@ class AcousticLink:
 
     def _rank_cells(self) -> None:
         """Own cells that look most like what others have seen go first: they may join."""
-        others = [h.outline for w, h in self._held.items() if w[0] != self._config.number]
+        others = self._held.outlines_of_others()
         for key, item in self._own.items():
-            outline = self._held[self._config.number, key.run, key.sequence].outline
-            if key.layer is not Layer.COARSE or outline is None:
+            held = self._held.own(key)
+            if key.layer is not Layer.COARSE or held is None or held.outline is None:
                 continue
-            likeness = [outline.likeness(other) for other in others if other is not None]
+            likeness = [held.outline.likeness(other) for other in others]
             item.rank = _CELLS_RANK + 0.4 / (1.0 + 0.1 * max(likeness, default=0.0))
 
     # --- packets out -------------------------------------------------------------------------
@@ -180,7 +166,12 @@ class AcousticLink:
         peers = self._peers(now_s)
         item = self._outbox.next_item(peers)
         notes: list[bytes] = []
-        if self._is_status_due(now_s, item is None):
+        if self._reporting.is_due(
+            now_s,
+            is_idle=item is None,
+            is_complete=self.is_complete,
+            is_unheard=self._outbox.is_unheard(peers),
+        ):
             notes = [self._report(now_s, peers)]
         while note := self._outbox.take_whole(self._room - len(bundled(notes)), peers):
             notes.append(note)
@@ -198,7 +189,7 @@ class AcousticLink:
                 label = "status"
             elif len(notes) == 1 and item is not None:
                 label = item.label
-        self._num_since_status = 0 if label == "status" else self._num_since_status + 1
+        self._reporting.sent(is_report=label == "status")
         self.counts.repairs = self._outbox.num_repairs
         counts = self.counts
         counts.sent_packets[label] = counts.sent_packets.get(label, 0) + 1
@@ -228,22 +219,6 @@ class AcousticLink:
         silent_s = self._config.silent_s
         return [peer for peer, heard_s in self._heard_s.items() if now_s - heard_s <= silent_s]
 
-    def _is_status_due(self, now_s: float, is_idle: bool) -> bool:
-        since_s, wait_s = now_s - self._last_status_s, self._config.status_s
-        if not is_idle:
-            # Turns that items wait for are not spent on reports alone.
-            is_time = self._num_since_status >= _PACKETS_PER_STATUS
-            return is_time and (self._news > 0 or not self.is_complete)
-        if self._news and since_s >= _HASTE * wait_s:
-            return True
-        # A report or the last of what was sent may have been lost.
-        is_open = not self.is_complete or self._outbox.is_unheard(self._peers(now_s))
-        if is_open:
-            # Soon once more, then ever more rarely: who does not answer may be far away.
-            wait_s *= _HASTE * 2.0**self._num_unanswered
-            return since_s >= min(wait_s, self._config.heartbeat_s)
-        return since_s >= self._config.heartbeat_s
-
     @property
     def _room(self) -> int:
         return self._config.packet_bytes - OVERHEAD_BYTES
@@ -251,28 +226,20 @@ class AcousticLink:
     def _bundle(self, notes: list[bytes]) -> bytes:
         return Packet(self._epoch, self._config.number, 0, 0, 0, bundled(notes)).pack(self._key)
 
-    def _status(self, peers: list[int]) -> Status:
-        # Another one first each time: there may not be room for all.
-        self._num_reports += 1
-        senders = sorted(self._inboxes)
-        first = self._num_reports % max(1, len(senders))
-        reports = {s: self._inboxes[s].report() for s in senders[first:] + senders[:first]}
-        return Status(len(self._outbox.items), self._outbox.voids(peers)[:8], reports)
-
     def _report(self, now_s: float, peers: list[int]) -> bytes:
         """What has come, as a note."""
-        is_old = self._news == 0
-        self._num_unanswered = min(self._num_unanswered + 1, _MAX_UNANSWERED) if is_old else 0
-        self._news, self._last_status_s = 0, now_s
-        status = self._status(peers)
-        while len(bundled([status.pack()])) > self._room:
-            status = _shortened(status)
-        return status.pack()
+        self._reporting.told(now_s)
+        # Another one first each time: there may not be room for all.
+        senders = sorted(self._inboxes)
+        first = self._reporting.num_reports % max(1, len(senders))
+        reports = {s: self._inboxes[s].report() for s in senders[first:] + senders[:first]}
+        status = Status(len(self._outbox.items), self._outbox.voids(peers)[:8], reports)
+        return fitted(status, self._room)
 
     # --- packets in --------------------------------------------------------------------------
 
     def receive(self, data: bytes, now_s: float) -> list[Submap]:
-        """Take a packet; returns submaps, of any vehicle, that are new or have changed by it.
+        """Take a packet; returns submaps of its sender that are new or have changed by it.
 
         What is damaged, of another version or without the fleet's key is counted and dropped.
         """
@@ -302,7 +269,7 @@ class AcousticLink:
         except InvalidInputError as error:
             self._refuse(error)
         self.counts.duplicates += inbox.num_duplicates - before
-        return [submap for one in {sender, self._config.number} for submap in self._improved(one)]
+        return self._held.improved(sender)
 
     def _refuse(self, error: InvalidInputError) -> None:
         reason = " ".join(str(error).split()[:3])
@@ -314,7 +281,7 @@ class AcousticLink:
             self._take_found(sender, inbox, inbox.add_whole(said))
         else:
             inbox.expect(said.num_items, said.voids)
-            self._news += not inbox.is_complete  # tell what is lacking
+            self._reporting.num_news += not inbox.is_complete  # tell what is lacking
             report = said.peers.get(self._config.number)
             if report is None and said.is_cut:
                 return
@@ -323,7 +290,7 @@ class AcousticLink:
             self._outbox.hear(sender, report)
 
     def _take_found(self, sender: int, inbox: Inbox, found: tuple[int, bytes] | None) -> None:
-        self._news += 1
+        self._reporting.num_news += 1
         if found is not None:
             number, item = found
             self._take_item(sender, item)
@@ -333,61 +300,21 @@ class AcousticLink:
     def _take_item(self, sender: int, item: bytes) -> None:
         kind, body = read_item(item)
         if kind is ItemKind.HELLO:
-            self._take_name(sender, body)
+            name = read_hello(body)
+            try:
+                self._held.take_name(sender, name)
+            except InvalidInputError as error:
+                self._refuse(error)  # no damage, so that sending it again would not help
         elif kind is ItemKind.LAYER:
             key, data = read_layer(body)
-            self._take_layer(sender, key, data)
+            self._held.take_layer(sender, key, data)
+            if key.layer is Layer.OUTLINE:
+                self._rank_cells()
         elif kind is ItemKind.ANSWER:
             decode_answer(body.rest)  # else it is refused
             self._answers.append(body.rest)
         else:
             raise InvalidInputError(f"an item of kind {kind.name}, expected one to keep")
-
-    def _take_name(self, sender: int, body: ByteReader) -> None:
-        name = read_hello(body)
-        known = self._names.get(sender)
-        if known == name:
-            return
-        if known is not None or name in self._names.values():
-            # No damage, so that sending it again would not help.
-            self._refuse(InvalidInputError(f"two vehicles are {name!r} or number {sender}"))
-            return
-        self._names[sender] = name
-
-    def _take_layer(self, sender: int, key: LayerKey, data: bytes) -> None:
-        if key.layer is Layer.OUTLINE:
-            outline = read_outline(data, self._key)
-            if LayerKey.of(outline.run_id, outline.sequence, key.layer) != key:
-                raise InvalidInputError(f"outline of submap {outline.sequence} came as {key}")
-        where = (sender, key.run, key.sequence)
-        held = self._held.get(where) or LayeredSubmap(self._key)
-        below = -1 if held.cells is None else int(held.cells.layer)
-        if key.layer > Layer.COARSE and below < key.layer - 1:
-            self._waiting[sender, key] = data
-            return
-        if held.add(data) is not key.layer:
-            raise InvalidInputError(f"a layer came as {key.layer.name}, which it is not")
-        self._held[where] = held
-        if key.layer is Layer.OUTLINE and sender != self._config.number:
-            self._rank_cells()
-        finer = LayerKey(key.run, key.sequence, Layer(min(key.layer + 1, Layer.FINE)))
-        if key.layer is not Layer.OUTLINE and (early := self._waiting.pop((sender, finer), None)):
-            self._take_layer(sender, finer, early)
-
-    def _improved(self, sender: int) -> list[Submap]:
-        """Submaps of a vehicle as they are now, if they were not given out like that before."""
-        name = self._names.get(sender)
-        if name is None:
-            return []
-        found = []
-        for where in sorted(key for key in self._held if key[0] == sender):
-            revision = self._held[where].revision
-            if revision is not None and revision > self._given.get(where, -1):
-                submap = self._held[where].submap(name)
-                assert submap is not None, "it has a revision"
-                self._given[where] = revision
-                found.append(submap)
-        return found
 
     # --- restarts ----------------------------------------------------------------------------
 
@@ -419,7 +346,7 @@ class AcousticLink:
             if kind is ItemKind.LAYER:
                 key, data = read_layer(body)
                 link._own[key] = item
-                link._take_layer(config.number, key, data)
+                link._held.take_layer(config.number, key, data)
         for sender, received in state.received.items():
             inbox = link._inboxes[sender] = Inbox(received.epoch)
             link._items[sender] = dict(received.items)
@@ -431,19 +358,4 @@ class AcousticLink:
 
     def submaps(self) -> Iterator[Submap]:
         """All submaps that can be drawn, of all vehicles whose names are known."""
-        for (sender, _, _), held in sorted(self._held.items()):
-            name = self._names.get(sender)
-            submap = None if name is None else held.submap(name)
-            if submap is not None:
-                yield submap
-
-
-def _shortened(status: Status) -> Status:
-    """With a little less about the one of whom most is said."""
-    longest = max(status.peers, key=lambda sender: len(status.peers[sender].lacking), default=None)
-    if longest is None or not status.peers[longest].lacking:
-        fewer = dict(list(status.peers.items())[:-1])
-        return Status(status.num_items, status.voids[:-1], fewer, bool(status.peers))
-    report = status.peers[longest]
-    short = PeerReport(report.epoch, report.base, report.lacking[:-1], True)
-    return Status(status.num_items, status.voids, status.peers | {longest: short}, status.is_cut)
+        return self._held.drawn()
