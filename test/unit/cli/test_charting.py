@@ -111,7 +111,7 @@ def test_a_chart_drawn_in_blocks_is_the_whole_chart(run, monkeypatch, side):
     _, pings = run
     own = [ping for pings_of_submap in pings.values() for ping in pings_of_submap]
     poses = np.array([(1.5 * k, -0.7 * k, 0.4 * k) for k in range(len(own))])
-    whole = GrowingGrid(CONFIG)
+    whole = GrowingGrid(CONFIG, share_against=drawing.SHARE_AGAINST)
     for ping, pose in zip(own, poses, strict=True):
         whole.add(ping.detections(), SE2.from_array(pose))
     expected = whole.trimmed().to_occupancy(8.0)

@@ -236,6 +236,17 @@ def test_a_weak_tail_behind_a_face_is_no_wall():
     assert log_odds_at(grid, 6.22, 0.02) is None
 
 
+def test_a_wall_that_most_pings_missed_stays_where_they_count_for_less():
+    config = OccupancyConfig(resolution_m=0.05, free_range_max_m=20.0)
+    bearings = np.linspace(-0.4, 0.4, 81)
+    for share, is_wall in ((1.0, False), (0.4, True)):
+        grid = GrowingGrid(config, share_against=share)
+        for number in range(8):
+            grid.add(wall_ping(6.0 if number == 0 else 9.0, bearings, beamwidth=0.01), SE2())
+        assert (log_odds_at(grid, 6.02, 0.02) > 0.0) == is_wall
+        assert log_odds_at(grid, 5.02, 0.02) == pytest.approx(-8 * config.free_log_odds)
+
+
 def test_a_compressed_grid_is_drawn_as_the_grid_itself(rng):
     grid = GrowingGrid(CONFIG)
     grid.add(random_ping(rng), SE2(3.0, 4.0, 1.0))

@@ -25,7 +25,7 @@ from uw_dslam_ros2.core.mapping.occupancy import SIGHT_CELLS, GrowingGrid, box_o
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["PingTrack", "draw_chart", "refined"]
+__all__ = ["SHARE_AGAINST", "PingTrack", "draw_chart", "refined"]
 
 FloatArray = NDArray[np.float64]
 
@@ -33,6 +33,9 @@ _BLOCK_M, _BLOCK_CELLS = 0.5, 6.0
 """A wall is straight within squares of this side, and as many cells of the map more."""
 _BLOCK_SIDE = 2048
 """Cells of the map are summed in squares of this side, one after the other."""
+SHARE_AGAINST = 0.4
+"""What a ping that looked through a wall says against it: most beams that meet a wall slantwise
+miss it, ping after ping. A submap, of a few pings, has to be sure of its walls."""
 _ROUNDED = 5
 """Digits kept of metres and radians: an equation's last digits depend on the machine."""
 
@@ -131,7 +134,7 @@ def draw_chart(
     for block in _blocks(whole):
         near = [p for p, own in zip(pings, reach, strict=True) if _meet(own, block)]
         if near:
-            grid = GrowingGrid(config, _grown(block))
+            grid = GrowingGrid(config, _grown(block), SHARE_AGAINST)
             for ping, scale, motion in near:
                 grid.add(ping.detections(scale), motion)
             drawn, percent = grid.percent(log_odds_max)

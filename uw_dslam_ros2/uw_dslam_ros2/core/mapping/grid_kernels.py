@@ -343,7 +343,7 @@ def _is_tail(heap, row, col, reach, share):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def draw_faces(  # type: ignore[no-untyped-def]
-    echoes, water, taps, gain, free, half_width, reach, least_share
+    echoes, water, taps, gain, free, against, half_width, reach, least_share
 ):  # fmt: skip
     """Log-odds (R, C) and what was observed, of summed evidence (see `add_ping`).
 
@@ -351,7 +351,7 @@ def draw_faces(  # type: ignore[no-untyped-def]
     face runs along the crest of the heap, `half_width` cells to each side. What is lower than
     `least_share` of something within `reach` cells is that one's tail. What lies before a face is
     as free as it was seen to be, unless more echoes came from there; what lies behind it nobody
-    has seen.
+    has seen. A ping that looked through takes `free` off free water and `against` off a face.
     """
     num_rows, num_cols = echoes.shape
     log_odds = np.zeros((num_rows, num_cols), np.int32)
@@ -363,7 +363,7 @@ def draw_faces(  # type: ignore[no-untyped-def]
             said = np.int32(np.rint(gain * heap[row, col]))
             is_face = said > 0 and _crest_distance(heap, row, col) <= half_width
             if is_face and not _is_tail(heap, row, col, reach, least_share):
-                log_odds[row, col] = said - passed
+                log_odds[row, col] = said - np.int32(against * water[row, col])
                 observed[row, col] = True
                 continue
             # Beside a face more echoes than water: neither a wall nor free.

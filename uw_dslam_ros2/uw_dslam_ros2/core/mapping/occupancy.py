@@ -167,14 +167,19 @@ class GrowingGrid:
         Grid and sensor model.
     only
         Lattice cells that are looked at, however far pings reach; None: all.
+    share_against
+        A ping that looked through a wall's face counts against it with that share of what it
+        says of water.
     """
 
     def __init__(
         self,
         config: OccupancyConfig = OccupancyConfig(),  # noqa: B008 (frozen)
         only: Window | None = None,
+        share_against: float = 1.0,
     ) -> None:
         self._config = config
+        self._share_against = share_against
         self._is_fixed = only is not None
         window = only or Window(0, 0, 0, 0)
         self._row, self._col = window.row_0, window.col_0
@@ -258,6 +263,7 @@ class GrowingGrid:
         What of a large map is needed on the way to that is many times as large.
         """
         window, cols = self._window()
+        free = self._config.free_log_odds * UNITS_PER_NAT
         for first in range(window.start, window.stop, _BAND_ROWS):
             last = min(first + _BAND_ROWS, window.stop)
             low = max(window.start, first - SIGHT_CELLS)
@@ -267,7 +273,8 @@ class GrowingGrid:
                 self._water[around, cols],
                 _SMOOTHING,
                 _SMOOTHING_GAIN,
-                round(self._config.free_log_odds * UNITS_PER_NAT),
+                round(free),
+                round(self._share_against * free),
                 _FACE_CELLS,
                 _TAIL_REACH_CELLS,
                 _TAIL_SHARE,
