@@ -13,7 +13,16 @@ from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, Occupancy
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import MapPair
 
-__all__ = ["VARIANTS", "doubled", "halved", "mirrored", "turned", "with_margins", "with_specks"]
+__all__ = [
+    "VARIANTS",
+    "coarser",
+    "coarser_pair",
+    "doubled",
+    "mirrored",
+    "turned",
+    "with_margins",
+    "with_specks",
+]
 
 Values = NDArray[np.int8]
 _UTM = SE2(412_345.6, 5_312_345.7, 0.8)
@@ -56,12 +65,13 @@ def doubled(occupancy: OccupancyMap) -> OccupancyMap:
     return OccupancyMap(spec, values)
 
 
-def halved(occupancy: OccupancyMap) -> OccupancyMap:
-    """The same map on cells twice as large, a wall where any of the four is one."""
-    rows, cols = (size - size % 2 for size in occupancy.spec.shape)
-    blocks = occupancy.values[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2)
+def coarser(occupancy: OccupancyMap, times: int) -> OccupancyMap:
+    """The same map on cells so many times as large, a wall where any that it is made of is one."""
+    rows, cols = (size // times for size in occupancy.spec.shape)
+    cut = occupancy.values[: rows * times, : cols * times]
+    blocks = cut.reshape(rows, times, cols, times)
     values = np.ascontiguousarray(blocks.max(axis=(1, 3)))
-    spec = _of_values(occupancy.spec, values, 2.0 * occupancy.spec.resolution_m)
+    spec = _of_values(occupancy.spec, values, times * occupancy.spec.resolution_m)
     return OccupancyMap(spec, values)
 
 
@@ -112,6 +122,11 @@ def _moved(pair: MapPair) -> MapPair:
     )
 
 
+def coarser_pair(times: int) -> Callable[[MapPair], MapPair]:
+    """The change of both maps to cells so many times as large."""
+    return _both(lambda occupancy: coarser(occupancy, times))
+
+
 VARIANTS: dict[str, Callable[[MapPair], MapPair]] = {
     "margins about both": _both(lambda m: with_margins(m, 37, 410, 205, 3)),
     "a canvas of 4000 cells about the source": lambda pair: replace(
@@ -123,6 +138,6 @@ VARIANTS: dict[str, Callable[[MapPair], MapPair]] = {
     "exchanged": _exchanged,
     "specks far away": lambda pair: replace(pair, source=with_specks(pair.source, 1)),
     "cells half as large": _both(doubled),
-    "cells twice as large": _both(halved),
+    "cells twice as large": coarser_pair(2),
 }
 """Changes of a pair, by name; the truth of the pair is changed with it."""

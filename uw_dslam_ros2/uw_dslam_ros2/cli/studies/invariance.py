@@ -7,7 +7,7 @@ mirrored, which nothing can repair. Writes a table and a CSV file with one line 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -20,9 +20,10 @@ from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfi
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import MapPair, pair_errors
-from uw_dslam_ros2.sim.map_variants import VARIANTS, mirrored
+from uw_dslam_ros2.sim.map_variants import VARIANTS, coarser_pair, mirrored
 
 Row = dict[str, Any]
+Changes = dict[str, Callable[[MapPair], MapPair]]
 _FIRST_SEED = 7000  # others than those of the fit
 _KINDS = ("harbour", "lake", "corridors", "office", "cave", "oblique")
 _MIRRORED = "mirrored"
@@ -34,6 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kinds", nargs="+", default=list(_KINDS), help="kinds of places")
     parser.add_argument("--overlaps", nargs="+", type=float, default=[0.3, 0.5, 0.7])
     parser.add_argument("--noises", nargs="+", default=["clean", "noisy", "hard"])
+    parser.add_argument(
+        "--coarser", nargs="*", type=int, default=[3], metavar="TIMES",
+        help="also on cells so many times as large",
+    )  # fmt: skip
     parser.add_argument("--size", type=int, default=160, help="side of a map [cells]")
 
 
@@ -41,26 +46,31 @@ def run(args: argparse.Namespace) -> int:
     """Register every telling of every pair, print the table."""
     seeds = range(_FIRST_SEED, _FIRST_SEED + args.seeds)
     specs = pair_specs(tuple(args.kinds), tuple(args.overlaps), tuple(args.noises), seeds)
+    changes = VARIANTS | {
+        f"cells {times} times as large": coarser_pair(times) for times in args.coarser
+    }
     rows: list[Row] = []
     for number, spec in enumerate(progress(list(specs), text="pairs")):
         pair = replace(spec, size_cells=args.size).make()
-        rows += [{"pair": number, "kind": spec.kind, **row} for row in _told_otherwise(pair)]
+        rows += [
+            {"pair": number, "kind": spec.kind, **row} for row in _told_otherwise(pair, changes)
+        ]
     write_csv(args.out / "invariance.csv", rows)
     print_table(
         ("told otherwise", "pairs", "same verdict", "accepted before", "accepted",
          "accepted now only", "most that a flip moved", "farthest off"),
-        [_summary(name, rows) for name in (*VARIANTS, _MIRRORED)],
+        [_summary(name, rows) for name in (*changes, _MIRRORED)],
     )  # fmt: skip
     return 0
 
 
-def _told_otherwise(pair: MapPair) -> Iterator[Row]:
+def _told_otherwise(pair: MapPair, changes: Changes) -> Iterator[Row]:
     told = _answer(pair)
     if told is None:
         return
     verdict, probability, T_target_source = told
     known = replace(pair, T_target_source=T_target_source)
-    others = {name: change(known) for name, change in VARIANTS.items()}
+    others = {name: change(known) for name, change in changes.items()}
     others[_MIRRORED] = replace(known, source=mirrored(known.source))
     for name, other in others.items():
         again = _answer(other)
