@@ -125,7 +125,8 @@ def pulled_by_fixes(
             found = pull.gathered(start)
             if len(found[0]) > max(1, len(best[0])):
                 best = found
-            if 2 * len(best[0]) > len(used):
+            # Of many, most are enough; of few, each one counts.
+            if len(best[0]) > (0.5 if len(used) > _MAX_STARTS else 0.99) * len(used):
                 break
     members, poses, T_earth_map = best
     # Where no two agree, there are too few to say which is wrong.
