@@ -110,19 +110,11 @@ class MapQueue:
 
     def forget_answers(self, vehicle_id: str) -> None:
         """Forget what was found about a vehicle's map: it is not any more what it was."""
-        about = {
-            key
-            for key, answer in self._answers.items()
-            if any(
-                submap_id.vehicle_id == vehicle_id
-                for group in (answer.query.source, answer.query.target)
-                for submap_id in group.ids
-            )
-        }
+        about = [key for key, answer in self._answers.items() if answer.is_of(vehicle_id)]
         if about:
             for key in about:
                 del self._answers[key]
-            self._now.held -= about
+            self._now.held -= set(about)
             self._change()
 
     @property

@@ -98,6 +98,11 @@ class Answer:
         """Whether probability and covariance are numbers."""
         return math.isfinite(self.probability) and bool(np.isfinite(self.covariance).all())
 
+    def is_of(self, vehicle_id: str) -> bool:
+        """Whether a submap of a vehicle was asked about."""
+        groups = self.query.source, self.query.target
+        return any(i.vehicle_id == vehicle_id for group in groups for i in group.ids)
+
     def is_about(self, prior: PriorWindow) -> bool:
         """Whether nearly this window was searched: the middle of each lies well in the other."""
         own = self.query.prior
