@@ -134,6 +134,15 @@ def test_wild_velocities_among_others_say_nothing_of_the_unit(recording, unit):
     assert found == ({} if unit == 1.0 else {"velocity_scale": 0.001})
 
 
+def test_a_bias_of_the_rates_counts_only_without_an_orientation(recording):
+    navigation, pings = recording
+    biased = replace(navigation, yaw_rate_rad_s=navigation.yaw_rate_rad_s + 0.004)
+    assert examine(biased, pings).findings == []
+    no_yaw = np.full(len(navigation.imu_s), math.nan)
+    (finding,) = examine(replace(biased, yaw_rad=no_yaw), pings).findings
+    assert finding.kind == "imu_drift"
+
+
 def test_without_a_dvl_the_imu_and_the_sonar_are_late_alike(recording):
     navigation, pings = late(imu_s=0.5)(*recording)
     alone = replace(

@@ -123,7 +123,13 @@ class _Trial:
             return
         self._yaw = by_rates if rates else imu.by_orientation
         self._delay_s = fits[0].delay_s
-        self._judge_drift(fits[0])
+        apart_rad_s = 0.0
+        if rates and orientation and self._result.conventions.imu_orientation != "none":
+            assert imu.by_orientation is not None
+            side = rates[0].sign * orientation[0].sign
+            apart = by_rates - side * imu.by_orientation
+            apart_rad_s = float((apart[-1] - apart[0]) / (imu_s[-1] - imu_s[0]))
+        self._judge_drift(fits[0], apart_rad_s)
         reading: _Reading | None = _Reading(fits[0].sign)
         if rates and orientation and rates[0].sign != orientation[0].sign:
             self._say_one_flipped(rates[0].sign, orientation[0].sign, orientation)
@@ -171,11 +177,14 @@ class _Trial:
         finding = Finding(kind, role, detail, confidence, vehicle_id=self._vehicle_id)
         self._result.add(finding, **changes)
 
-    def _judge_drift(self, fit: TurnFit) -> None:
+    def _judge_drift(self, fit: TurnFit, apart_rad_s: float) -> None:
+        """Tell of a heading that drifts, unless its orientation does so less by `apart_rad_s`."""
         assert self._yaw is not None
         bias, sigma = turn_bias(self._motions, self._navigation.imu_s, self._yaw, fit)
         if abs(bias) < max(_MIN_DRIFT_RAD_S, 5.0 * sigma):
             return
+        if abs(bias - apart_rad_s) < 0.5 * abs(bias):
+            return  # beside an orientation that holds, the mapper's filter finds the bias
         self._add(
             "imu_drift",
             "imu",
