@@ -24,6 +24,7 @@ __all__ = ["SQUARE", "Drawable", "Mosaic", "Window", "fuse_maps"]
 SQUARE = 256
 """Cells are kept in squares of so many rows and columns."""
 _UNSEEN = int(UNSEEN)
+_STRIP_ROWS = 256
 
 
 class Drawable(Protocol):
@@ -228,11 +229,16 @@ class Mosaic:
             table[list(after)] = list(after.values())
             part[alone.observed] = table[before]
         # Sets that a later grid has covered wholly are used by no cell any more.
-        is_used = np.bincount(owners.ravel(), minlength=len(sets)) > 0
+        is_used = np.zeros(len(sets), np.bool_)
         is_used[0] = True
+        strips = [owners[row : row + _STRIP_ROWS] for row in range(0, len(owners), _STRIP_ROWS)]
+        for strip in strips:  # counting takes eight bytes a cell
+            is_used |= np.bincount(strip.ravel(), minlength=len(sets)) > 0
         packed = (np.cumsum(is_used) - 1).astype(np.uint32)
+        for strip in strips:
+            strip[:] = packed[strip]
         used = np.flatnonzero(is_used).tolist()
-        return packed[owners], [sets[number] for number in used]
+        return owners, [sets[number] for number in used]
 
     def _draw(self, grid: Drawable, T_frame_map: SE2, sign: int) -> Window | None:
         """Add a grid to the tiles, or subtract it; returns the rectangle that it has seen."""
