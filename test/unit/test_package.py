@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -117,3 +118,10 @@ def test_colcon_finds_the_tests_of_the_checkout():
     assert done.returncode == 0, done.stdout + done.stderr
     assert "test_run_names.py" in done.stdout
     assert "testpaths = ../test/unit\n" in (PACKAGE / "setup.cfg").read_text()
+
+
+def test_the_release_tools_changelog_has_the_versions_of_the_changelog():
+    versions = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    text = (PACKAGE / "CHANGELOG.rst").read_text()
+    told = re.findall(r"^(Forthcoming|\d+\.\d+\.\d+)(?: \(.*\))?\n-+$", text, re.M)
+    assert told == ["Forthcoming" if name == "Unreleased" else name for name in versions]
