@@ -13,6 +13,7 @@ from pathlib import Path
 
 from uw_dslam_ros2.cli.charting import charted
 from uw_dslam_ros2.cli.common import parser_for, progress_bar, run_command, versions
+from uw_dslam_ros2.cli.heap import give_back, keep_apart
 from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recordings, sensor_config, settle
 from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
 from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
@@ -101,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(args: argparse.Namespace) -> int:
     started_s = time.monotonic()
+    keep_apart()
     if args.fixes is not None and not 0.0 < args.fixes < math.inf:
         raise ConfigError(f"--fixes is {args.fixes}, expected metres > 0")
     named = _named_bags(args.vehicle)
@@ -138,6 +140,7 @@ def _run(args: argparse.Namespace) -> int:
             queue.add_submap(submap)
     for decision in decisions:
         queue.decide(decision)
+    give_back()
     say(f"merging {len(queue.submaps())} submaps")
     with progress_bar("registering", " pairs") as progress:
         settle(queue, config.registration, progress)
@@ -146,14 +149,20 @@ def _run(args: argparse.Namespace) -> int:
         submaps = [submap for made in mapped for submap in made.submaps]
         queue.add_fixes(fixes_of_recordings(events, submaps, args.fixes))
     merged_s = time.monotonic()
+    give_back()
 
     outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
     findings += left_out(outcome)
     if args.fixes is not None:
         findings += about_fixes(outcome.georeference or queue.why_no_georeference())
+    save_session(args.out / SESSION_FOLDER, queue)  # for view, and to go on from
+    del queue  # as large as all maps together
+    give_back()
     pings = {key: own for made in mapped for key, own in made.pings.items()}
     occupancy = config.mapper[mapped[0].vehicle_id].occupancy
     outcome = charted(outcome, pings, occupancy, findings.append)
+    diagnostics = {made.vehicle_id: made.diagnostics for made in mapped}
+    del mapped, made, pings
     facts = RunFacts(
         title=args.title or "offline: " + ", ".join(vehicles),
         source=[bag.name for bag in bags],
@@ -161,13 +170,13 @@ def _run(args: argparse.Namespace) -> int:
         settings=config.to_dict(),
         seeds={},
         versions=versions(),
-        diagnostics={made.vehicle_id: made.diagnostics for made in mapped},
+        diagnostics=diagnostics,
         notes=[finding.sentence for finding in findings if finding.severity != "info"],
         findings=[finding.to_dict() for finding in findings],
     )
     for note in facts.notes:
         print(f"warning: {note}", file=sys.stderr, flush=True)
-    save_session(args.out / SESSION_FOLDER, queue)  # for view, and to go on from
+    give_back()
     scores = write_report(args.out, outcome, facts, truth, has_pictures=not args.no_report)
     done_s = time.monotonic()
     say(

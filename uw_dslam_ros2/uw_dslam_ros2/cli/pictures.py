@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -65,6 +66,7 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 DECIDED_COLOR = "#5b2a86"
 _COMPARED = (UNKNOWN_COLOR, SEEN_COLOR, FREE_COLOR, MISSING_COLOR, AGREE_COLOR, EXTRA_COLOR)
+_STRIP_ROWS = 256
 _UNKNOWN, _SEEN, _FREE, _MISSING, _AGREE, _EXTRA = range(len(_COMPARED))
 
 
@@ -252,14 +254,21 @@ def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure |
     found = resample(outcome.global_map, spec, scores.trajectory.T_truth_map)
     true = resample(truth.map, spec)
     tolerance_cells = 0.25 / spec.resolution_m
-    near_true = near_walls(true > 50, tolerance_cells)
-    near_found = near_walls(found > 50, tolerance_cells)
     shown = np.full(spec.shape, _UNKNOWN, np.uint8)
-    shown[(found >= 0) | (true >= 0)] = _SEEN
-    shown[found >= 0] = _FREE
-    shown[(true > 50) & ~near_found] = _MISSING
-    shown[(found > 50) & near_true] = _AGREE
-    shown[(found > 50) & ~near_true] = _EXTRA
+    reach = math.ceil(tolerance_cells) + 1
+    # By strips: what is worked out on the way would take several times the room of the picture.
+    for first in range(0, spec.num_rows, _STRIP_ROWS):
+        low, last = max(0, first - reach), first + _STRIP_ROWS
+        own, around = slice(first, last), slice(low, last + reach)
+        inside = slice(first - low, last - low)
+        near_true = near_walls(true[around] > 50, tolerance_cells)[inside]
+        near_found = near_walls(found[around] > 50, tolerance_cells)[inside]
+        strip, walls, true_walls = shown[own], found[own] > 50, true[own] > 50
+        strip[(found[own] >= 0) | (true[own] >= 0)] = _SEEN
+        strip[found[own] >= 0] = _FREE
+        strip[true_walls & ~near_found] = _MISSING
+        strip[walls & near_true] = _AGREE
+        strip[walls & ~near_true] = _EXTRA
     figure, axes = single_map(spec)
     show_cells(axes, shown, _COMPARED, spec)
     scale_bar(axes)

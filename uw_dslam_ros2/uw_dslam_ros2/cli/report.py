@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import jinja2
+from matplotlib.figure import Figure
 
 from uw_dslam_ros2.cli import pictures
+from uw_dslam_ros2.cli.heap import give_back
 from uw_dslam_ros2.cli.link_report import known_over_time
 from uw_dslam_ros2.cli.outcome import Outcome, json_bytes, write_outcome
 from uw_dslam_ros2.cli.scoring import Scores, Truth, score
@@ -182,20 +184,28 @@ def whose_error(scored: Sequence[str], num_vehicles: int) -> str:
 def _draw(
     outcome: Outcome, facts: RunFacts, truth: Truth | None, scores: Scores
 ) -> dict[str, bytes]:
-    num = len(outcome.vehicles)
-    number = {1: "One map", 2: "Two maps", 3: "Three maps", 4: "Four maps"}.get(num, f"{num} maps")
-    figures = {"before_after": pictures.before_after(outcome, f"{number} before, one map after")}
-    if truth is not None:
-        comparison = pictures.truth_comparison(outcome, truth, scores)
-        errors = pictures.error_plot(outcome, truth, scores)
-        figures |= {} if comparison is None else {"map_against_truth": comparison}
-        figures |= {} if errors is None else {"trajectory_error": errors}
-    if facts.link:
-        figures["link"] = known_over_time(facts.link)
-    images = {name: pictures.png_bytes(figure) for name, figure in figures.items()}
+    images: dict[str, bytes] = {}
+    for name, figure in _figures(outcome, facts, truth, scores):
+        if figure is not None:
+            images[name] = pictures.png_bytes(figure)
     for index, look in outcome.looks:
         images[f"match_{index}"] = look.picture("agreement", _LOOK_PIXELS)
     return images
+
+
+def _figures(
+    outcome: Outcome, facts: RunFacts, truth: Truth | None, scores: Scores
+) -> Iterator[tuple[str, Figure | None]]:
+    """One after the other, for each holds its maps as pictures."""
+    num = len(outcome.vehicles)
+    number = {1: "One map", 2: "Two maps", 3: "Three maps", 4: "Four maps"}.get(num, f"{num} maps")
+    yield "before_after", pictures.before_after(outcome, f"{number} before, one map after")
+    if truth is not None:
+        give_back()
+        yield "map_against_truth", pictures.truth_comparison(outcome, truth, scores)
+        yield "trajectory_error", pictures.error_plot(outcome, truth, scores)
+    if facts.link:
+        yield "link", known_over_time(facts.link)
 
 
 def render_html(
