@@ -86,3 +86,15 @@ def test_nothing_mapped_is_an_error_that_says_why():
     *_, last = health_findings(replace(GOOD, sensors=without("sonar"), counts=counts))
     assert (last.kind, last.severity) == ("nothing_mapped", "error")
     assert last.sentence.startswith("auv_1: nothing was mapped (sonar: there is no topic")
+
+
+def test_velocities_that_come_seldom_are_told():
+    for period_s, is_told in ((0.2, False), (2.0, False), (5.0, True)):
+        vehicle = MappedVehicle(
+            "auv_1",
+            {role: SensorCount(25) for role in ("sonar", "imu", "velocity")},
+            {"num_submaps": 1},
+            spans={"velocity": (0, int(24 * period_s * 1e9))},
+        )
+        told = [f.kind for f in health_findings(vehicle)]
+        assert told == (["seldom"] if is_told else [])

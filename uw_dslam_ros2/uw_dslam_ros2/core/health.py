@@ -20,6 +20,7 @@ _MOST = 0.5
 _NEARLY_ALL = 0.9
 _FEW_MATCHES = 0.3
 _MOVED_M = 1.0
+_SELDOM_S = 2.5
 _Tell = Callable[[str, str, str], None]
 _NAVIGATION = ("velocity", "imu", "odometry")
 
@@ -73,6 +74,7 @@ def sensor_findings(vehicle: MappedVehicle) -> list[Finding]:
 
     _check_sensors(vehicle, tell)
     _check_overlap(vehicle, tell)
+    _check_rate(vehicle, tell)
     return found
 
 
@@ -85,6 +87,7 @@ def health_findings(vehicle: MappedVehicle) -> list[Finding]:
 
     _check_sensors(vehicle, tell)
     _check_overlap(vehicle, tell)
+    _check_rate(vehicle, tell)
     _check_pings(vehicle, tell)
     _check_navigation(vehicle, tell)
     _check_gaps(vehicle, tell)
@@ -158,6 +161,20 @@ def _check_overlap(vehicle: MappedVehicle, tell: _Tell) -> None:
                     f"its stamps and those of the sonar do not overlap: they are {apart_s:.0f} s "
                     "apart; are the clocks of both computers set?",
                 )
+
+
+def _check_rate(vehicle: MappedVehicle, tell: _Tell) -> None:
+    num = vehicle.sensors.get("velocity", SensorCount(0)).num
+    if num < 2 or "velocity" not in vehicle.spans:
+        return
+    first_ns, last_ns = vehicle.spans["velocity"]
+    period_s = (last_ns - first_ns) * 1e-9 / (num - 1)
+    if period_s > _SELDOM_S:
+        tell(
+            "seldom",
+            "velocity",
+            f"it has a message only every {period_s:.0f} s, and between them the speed is guessed",
+        )
 
 
 def _check_pings(vehicle: MappedVehicle, tell: _Tell) -> None:
