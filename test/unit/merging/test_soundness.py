@@ -1,6 +1,7 @@
 """What one vehicle sends cannot bend, displace or stop the map of the others."""
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -11,13 +12,16 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
 from uw_dslam_ros2.core.merging import planning as planning_module
-from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track
+from uw_dslam_ros2.core.merging.checks.soundness import contested_track, contradicting_track
 from uw_dslam_ros2.core.merging.decisions import DecisionLog
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
 from uw_dslam_ros2.core.merging.graph.components import Constraint
+from uw_dslam_ros2.core.merging.graph.constraints import constraint_of
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
-from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
+from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapGroup
 from uw_dslam_ros2.core.merging.types import Edge
+from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track
 from uw_dslam_ros2.sim.fleets import (
@@ -160,6 +164,64 @@ def test_who_contradicts_most_of_the_others_is_set_aside():
 def test_a_single_false_match_makes_nobody_a_liar():
     assert judged([*HONEST, (0, 1, 8.0)]) is None
     assert judged([(0, 1, 0.0), (1, 2, 0.0), (0, 2, 8.0)]) is None
+
+
+def contested(matches, num_submaps=1, *, is_confirmed=True):
+    """Whose place is contested, of four vehicles in one place; ends are (vehicle, submap)."""
+    fleet = fleet_of(4, num_submaps)
+    ids = sorted(fleet.submaps)
+    library = Library(
+        {i: StoredSubmap.of(s, 10**6) for i, s in fleet.submaps.items()}, DecisionLog(), Memory()
+    )
+    truth = fleet.T_world_submap
+    answers = []
+    for a, b, shift_m, probability in matches:
+        source, target = (ids[end[0] * num_submaps + end[1]] for end in (a, b))
+        groups = [SubmapGroup.of([library.submaps[i]], [SE2()], 0) for i in (source, target)]
+        motion = SE2(shift_m, 0.0) @ truth[target].inverse() @ truth[source]
+        window = PriorWindow(motion, 5.0, 0.5)  # one pair, asked at two places
+        answers.append(
+            Answer(Query(*groups, window), Verdict.ACCEPTED, "", motion,
+                   np.diag([0.01, 0.01, 1e-4]), probability)
+        )  # fmt: skip
+    assert all(answer.is_accepted for answer in answers)
+    # What checks do not confirm is no constraint, and was accepted all the same.
+    believed = [
+        constraint_of(library, answer)
+        for answer, (*_, shift_m, _) in zip(answers, matches, strict=True)
+        if is_confirmed or shift_m == 0.0
+    ]
+    solved, components = library.solve(ids[0], believed)
+    found = contested_track(library, solved, answers, components)
+    return None if found is None else (found.track.vehicle_id, round(found.distance_m))
+
+
+FIRM = [((0, 0), (1, 0), 0.0, 0.99), ((1, 0), (2, 0), 0.0, 0.99), ((0, 0), (2, 0), 0.0, 0.99)]
+HERE = [((3, 0), (v, 0), 0.0, 0.94) for v in (0, 1, 2)]
+
+
+@pytest.mark.parametrize("is_confirmed", [True, False])
+def test_a_submap_that_looks_like_two_places_is_in_neither(is_confirmed):
+    """However many have seen the one place: that they agree says nothing about the submap."""
+    judge = functools.partial(contested, is_confirmed=is_confirmed)
+    assert judge([*FIRM, *HERE]) is None
+    assert judge([*FIRM, *HERE, ((3, 0), (1, 0), 40.0, 0.95)]) == ("auv_4", 40)
+    assert judge([*FIRM, *HERE, ((3, 0), (1, 0), 40.0, 0.8)]) is None  # 16 : 4
+    assert judge([*FIRM, *HERE, ((3, 0), (1, 0), 40.0, 0.85)]) == ("auv_4", 40)
+    sure = ((3, 0), (2, 0), 0.0, 0.98)
+    assert judge([*FIRM, *HERE, sure, ((3, 0), (1, 0), 40.0, 0.95)]) is None
+
+
+def test_a_pose_that_is_bent_is_no_other_place():
+    assert contested([*FIRM, *HERE, ((3, 0), (1, 0), 1.5, 0.95)]) is None
+
+
+def test_two_submaps_of_a_run_outweigh_a_third_that_looks_like_another_place():
+    firm = [((v, 0), (v + 1, 0), 0.0, 0.99) for v in (0, 1)]
+    here = [((3, k), (v, k), 0.0, 0.94) for k in (0, 1) for v in (0, 1, 2)]
+    there = ((3, 2), (1, 2), 40.0, 0.95)
+    assert contested([*firm, *here, there], num_submaps=3) is None
+    assert contested([*firm, *here[:3], there], num_submaps=3) == ("auv_4", 40)
 
 
 def test_a_run_that_contradicts_the_rest_is_set_aside_until_it_does_not(monkeypatch):

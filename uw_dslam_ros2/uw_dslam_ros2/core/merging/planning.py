@@ -12,7 +12,11 @@ from uw_dslam_ros2.core.merging.asking.pairwise import make_pairwise_plan
 from uw_dslam_ros2.core.merging.asking.plan import Plan, make_plan
 from uw_dslam_ros2.core.merging.by_hand import matches_by_hand
 from uw_dslam_ros2.core.merging.checks.contradictions import contradicting_map
-from uw_dslam_ros2.core.merging.checks.soundness import contradicting_track, implausible_submaps
+from uw_dslam_ros2.core.merging.checks.soundness import (
+    contested_track,
+    contradicting_track,
+    implausible_submaps,
+)
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.georeference import Fix, Georeference, pulled_by_fixes
@@ -93,7 +97,7 @@ class Planning:
             self._contradicting, self.doubts = [], {}
             sound = library
             while len(self._contradicting) < len(tracks) and not plan.wanted:
-                track, why = self._unsound(sound, plan)
+                track, why = self._unsound(sound, plan, answers)
                 if track is None:
                     break
                 if track in wanted_tracks:
@@ -139,11 +143,21 @@ class Planning:
             told.append(georeference)
         return dataclasses.replace(plan, components=components, georeference=told[0])
 
-    def _unsound(self, library: Library, plan: Plan) -> tuple[Track | None, str]:
+    def _unsound(
+        self, library: Library, plan: Plan, answers: Mapping[QueryKey, Answer]
+    ) -> tuple[Track | None, str]:
         """The run that contradicts the others, by its matches or by its map, and how."""
         track = contradicting_track(library, plan.constraints, min(library.submaps))
         if track is not None:
             return track, "which contradicts the others' maps: most of its matches do not hold"
+        contest = None
+        if self._config.mode != "pairwise":  # that keeps the first answer, whatever others say
+            contest = contested_track(library, plan.constraints, answers.values(), plan.components)
+        if contest is not None:
+            return contest.track, (
+                f"whose place is contested: accepted matches put it {contest.distance_m:.0f} m "
+                "from where others put it, and neither place is clearly more likely"
+            )
         found = contradicting_map(library.active, plan.components, self._memory)
         if found is None:
             return None, ""

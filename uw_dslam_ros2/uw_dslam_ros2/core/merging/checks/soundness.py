@@ -5,25 +5,42 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.merging.graph.components import Constraint
+from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
+from uw_dslam_ros2.core.merging.graph.components import Component, Constraint
+from uw_dslam_ros2.core.merging.graph.constraints import constraint_of
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
-__all__ = ["contradicting_track", "implausible_submaps"]
+__all__ = ["Contest", "contested_track", "contradicting_track", "implausible_submaps"]
 
 _SLACK_S = 1.0
 """Between the last ping of a submap and the first of the next one, beside what stamps say."""
 _SIGMAS = 5.0
 _MIN_TRACKS = 3
 _MIN_BROKEN = 3
+_LEAST_ODDS = 3.0
+"""By which a place must be more likely than the next one; as `max_false_accept` of 0.25 says."""
+_SURE = 0.97
+"""A place that is likelier than that by itself is not contested: what most matches say counts."""
+_ELSEWHERE_SHARE, _ELSEWHERE_RAD = 0.2, 0.35
+"""Beyond this share of a submap's radius, or this turn, a pose is another place and no bend."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contest:
+    """A run that matches put in two places, and how far apart these are."""
+
+    track: Track
+    distance_m: float
 
 
 def implausible_submaps(
@@ -93,6 +110,133 @@ def contradicting_track(
             blame[track] = broken - held
     worst = [track for track in blame if blame[track] == max(blame.values())]
     return worst[0] if len(worst) == 1 else None
+
+
+def contested_track(
+    library: Library,
+    constraints: Sequence[Constraint],
+    answers: Iterable[Answer],
+    components: Sequence[Component],
+) -> Contest | None:
+    """The run that accepted matches put somewhere else about as likely as where it is.
+
+    A graph keeps what most matches say. But matches of one submap with ten views of one place are
+    one opinion, not ten: the submap looks like that place. So of all matches of each of the
+    run's own submaps the most probable one counts, and submaps count together. Where the place
+    that the graph has chosen is neither sure by itself nor clearly ahead, nobody knows where the
+    run is.
+
+    Parameters
+    ----------
+    library
+        All submaps.
+    constraints
+        Of a plan in which nothing is open, and what became of them.
+    answers
+        Everything that was asked: what the checks of a match did not confirm was accepted all the
+        same.
+    components
+        Poses by these constraints.
+    """
+    held = [c for c in constraints if c.is_inlier and _is_between_tracks(c)]
+    against = _accepted_beside(library, answers, {c.key for c in held})
+    found: list[tuple[float, Contest]] = []
+    for component in components:
+        here = [c for c in against if c.edge.source in component and c.edge.target in component]
+        for track in sorted({track for c in here for track in _ends(c)}):
+            rival, distance_m = _rival_place(
+                library, component, track, [c for c in here if track in _ends(c)]
+            )
+            if not rival:
+                continue
+            own = [c for c in held if track in _ends(c)]
+            log_odds = _log_odds(own, track), _log_odds(rival, track)
+            lead = log_odds[0] - log_odds[1]
+            if log_odds[0] < _logit(_SURE) and lead < math.log(_LEAST_ODDS):
+                found.append((lead, Contest(track, distance_m)))
+    if not found:
+        return None
+    # Where both sides of a match are in doubt alike, one of them stays.
+    least = min(lead for lead, _ in found)
+    return max((one for lead, one in found if lead == least), key=lambda one: one.track)
+
+
+def _accepted_beside(
+    library: Library, answers: Iterable[Answer], held: Container[QueryKey]
+) -> list[Constraint]:
+    """What was accepted between runs and does not hold."""
+    beside = [
+        answer
+        for answer in answers
+        if answer.is_accepted and answer.query.key not in held and library.holds(answer.query)
+    ]
+    found = []
+    for answer in sorted(beside, key=lambda answer: answer.query.key):
+        key = "beside", answer.query.key, answer.T_target_source, answer.probability
+        states = library.state_of(answer.query.source), library.state_of(answer.query.target)
+        work = functools.partial(constraint_of, library, answer)
+        constraint = library.remember((*key, states), work)
+        if _is_between_tracks(constraint):
+            found.append(constraint)
+    return found
+
+
+def _is_between_tracks(constraint: Constraint) -> bool:
+    return constraint.edge.source.track != constraint.edge.target.track
+
+
+def _rival_place(
+    library: Library, component: Component, track: Track, others: Sequence[Constraint]
+) -> tuple[list[Constraint], float]:
+    """The matches that agree on the most likely other place of a run, and how far away it is."""
+    best: tuple[float, list[Constraint], float] = (0.0, [], 0.0)
+    moves = [(_own_end(c, track), _move(component, c, track), c) for c in others]
+    away = [move for move in moves if _is_elsewhere(library, component, move[0], move[1])]
+    for end, move, _ in away:
+        back = move.inverse()
+        same = [(e, c) for e, m, c in away if not _is_elsewhere(library, component, e, back @ m)]
+        rival = [c for _, c in same]
+        log_odds = _log_odds(rival, track)
+        if log_odds > best[0]:
+            here = component[end]
+            there = move @ here
+            best = log_odds, rival, math.hypot(there.x - here.x, there.y - here.y)
+    return best[1], best[2]
+
+
+def _move(component: Component, constraint: Constraint, track: Track) -> SE2:
+    """How the whole run would have to move for a match to hold."""
+    edge = constraint.edge
+    if edge.target.track == track:
+        edge = edge.reversed()
+    return component[edge.target] @ edge.T_target_source @ component[edge.source].inverse()
+
+
+def _is_elsewhere(library: Library, component: Component, submap_id: SubmapId, move: SE2) -> bool:
+    """Whether a move takes a submap to another place, beyond what maps bend."""
+    here = component[submap_id]
+    there = move @ here
+    way_m = math.hypot(there.x - here.x, there.y - here.y)
+    turn = abs(math.remainder(there.yaw - here.yaw, 2.0 * math.pi))
+    return way_m > _ELSEWHERE_SHARE * library.submaps[submap_id].radius_m or turn > _ELSEWHERE_RAD
+
+
+def _own_end(constraint: Constraint, track: Track) -> SubmapId:
+    edge = constraint.edge
+    return edge.source if edge.source.track == track else edge.target
+
+
+def _log_odds(constraints: Sequence[Constraint], track: Track) -> float:
+    """What a run's own submaps say together, each by its most probable match."""
+    best: dict[SubmapId, float] = {}
+    for constraint in constraints:
+        end = _own_end(constraint, track)
+        best[end] = max(best.get(end, 0.5), constraint.probability)
+    return sum(_logit(probability) for probability in best.values())
+
+
+def _logit(probability: float) -> float:
+    return math.log(probability / max(1.0 - probability, 1e-9))
 
 
 def _ends(constraint: Constraint) -> tuple[Track, Track]:
