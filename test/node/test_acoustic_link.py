@@ -105,7 +105,8 @@ def test_nothing_arrives_in_a_blackout_and_all_of_it_afterwards(fleet):
         send(room_submap("auv_1", 0))
         until(lambda: fleet.water._report()[2]["blacked out"] > 0, "a packet that is lost")
         assert not got[2]
-        until(lambda: got[2], "the submap")
+        # Where all of it was sent in the blackout, a heartbeat is what gets it going again.
+        until(lambda: got[2], "the submap", deadline_s=120.0)
         assert fleet.water._now_s() > 8.0
 
 

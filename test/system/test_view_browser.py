@@ -39,6 +39,16 @@ def browser():
         made.close()
 
 
+async def _drained():
+    """End what is left over, and let connections that were closed tell their loop."""
+    left = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in left:
+        task.cancel()
+    await asyncio.gather(*left, return_exceptions=True)
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
 @contextlib.contextmanager
 def served(source):
     """The address of a view, served from a thread."""
@@ -54,6 +64,7 @@ def served(source):
         yield run(server.start())
     finally:
         run(server.stop())
+        run(_drained())
         loop.call_soon_threadsafe(loop.stop)
         thread.join(10)
         loop.close()
