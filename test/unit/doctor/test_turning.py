@@ -63,9 +63,9 @@ def recording(seed, turning=TURN, delay_s=0.0, duration_s=700.0):
 
 
 def examined(navigation, beams):
-    found = Examination()
+    found = Examination(vehicle_id="auv_1")
     spans = choose_spans(navigation, beams.stamp_s)
-    examine_turning(found, navigation, beams, spans, "auv_1")
+    examine_turning(found, navigation, beams, spans)
     return found
 
 

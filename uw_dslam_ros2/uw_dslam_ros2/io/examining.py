@@ -118,7 +118,7 @@ def examine_readings(
         spans = choose_spans(navigation, collector.seconds(np.unique(stamps["sonar"])))
         inside = _inside(spans, collector.start_ns)
         collect(lambda role, stamp_ns: role == "sonar" and inside(stamp_ns))
-        examine_turning(found, navigation, collector.beams(), spans, vehicle_id)
+        examine_turning(found, navigation, collector.beams(), spans)
     if is_axis_open:
         found.findings = [
             replace(f, severity="info") if f.kind == "dvl_mirrored" else f for f in found.findings

@@ -9,7 +9,7 @@ import numpy as np
 
 from uw_dslam_ros2.core.doctor.fits import TurnFit, VelocityFit, confidence_of
 
-__all__ = ["Delays", "find_delays"]
+__all__ = ["Delays", "find_delays", "late_in_words"]
 
 _MAX_DELAY_S = 2.3
 _COARSE_S, _FINE_S = 0.1, 0.02
@@ -86,3 +86,8 @@ def _best(way: Callable[[float], VelocityFit | None]) -> tuple[VelocityFit | Non
 
 def _cost(fit: VelocityFit | None) -> float:
     return np.inf if fit is None else float(np.nanmean(fit.cost))
+
+
+def late_in_words(delay_s: float) -> str:
+    """How much later or earlier."""
+    return f"{abs(delay_s):.2f} s {'later' if delay_s > 0.0 else 'earlier'}"

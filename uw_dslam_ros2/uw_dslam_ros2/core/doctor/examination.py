@@ -31,6 +31,8 @@ class Examination:
     """Whether enough motions of the echoes lay within known velocities."""
     pixels: str = ""
     """What the sonar's images hold: compressed, amplitude, power, decibel; "": not known."""
+    vehicle_id: str = ""
+    """Whose it is."""
 
     def add(self, finding: Finding, **changes: str | float | bool) -> None:
         """Name a cause, and what to change."""
@@ -38,3 +40,14 @@ class Examination:
         if changes:
             self.mended.add(finding.kind)
         self.conventions = Conventions(**(self.conventions.to_dict() | changes))
+
+    def tell(
+        self,
+        kind: str,
+        role: str,
+        detail: str,
+        confidence: float = 1.0,
+        **changes: str | float | bool,
+    ) -> None:
+        """Name a cause of this vehicle; see `Finding` and `add`."""
+        self.add(Finding(kind, role, detail, confidence, vehicle_id=self.vehicle_id), **changes)

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.alone import judge_imu, without_spikes, without_zeros
-from uw_dslam_ros2.core.doctor.delays import Delays, find_delays
+from uw_dslam_ros2.core.doctor.delays import Delays, find_delays, late_in_words
 from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.fits import (
+    SURE,
     TurnFit,
     VelocityFit,
     believed,
@@ -30,13 +31,11 @@ from uw_dslam_ros2.core.doctor.odometry import OdometrySample, examine_odometry
 from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
 from uw_dslam_ros2.core.doctor.scales import confidence_in, judge_scale
-from uw_dslam_ros2.core.findings import Finding
 
 __all__ = ["examine"]
 
 FloatArray = NDArray[np.float64]
 
-_SURE = 0.99
 _LIKELY = 0.95  # enough to tell of a late dvl, not to correct it
 _MIN_MOTIONS = 15
 _MIN_READINGS = 20
@@ -54,10 +53,10 @@ def examine(
 
     `pings` are bursts: each but the last of a burst has another about a second later.
     """
-    result = Examination(pixels=pings.pixels or "")
+    result = Examination(pixels=pings.pixels or "", vehicle_id=vehicle_id)
     result.has_yaw = bool(np.isfinite(navigation.yaw_rad).any())
     result.has_yaw_rate = bool(np.isfinite(navigation.yaw_rate_rad_s).any())
-    judge_images(result, pings, vehicle_id)
+    judge_images(result, pings)
     has_imu = len(navigation.imu_s) >= _MIN_READINGS
     has_odometry = odometry is not None and len(odometry.stamp_s) >= _MIN_READINGS
     if not has_imu and not has_odometry:
@@ -65,16 +64,14 @@ def examine(
     motions = ping_motions(pings, 0.7, 2.1)
     result.num_ping_motions = len(motions)
     if odometry is not None and has_odometry:
-        examine_odometry(
-            result, odometry, motions, pings.T_base_sonar, vehicle_id, is_alone=not has_imu
-        )
+        examine_odometry(result, odometry, motions, pings.T_base_sonar, is_alone=not has_imu)
     if not has_imu:
         return result
     imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
-    judge_imu(result, imu, vehicle_id)
-    navigation = without_spikes(without_zeros(result, navigation, vehicle_id))
+    judge_imu(result, imu)
+    navigation = without_spikes(without_zeros(result, navigation))
     if len(motions) >= _MIN_MOTIONS:
-        _Trial(result, navigation, imu, motions, pings, vehicle_id).run()
+        _Trial(result, navigation, imu, motions, pings).run()
     return result
 
 
@@ -97,14 +94,12 @@ class _Trial:
         imu: ImuState,
         motions: PingMotions,
         pings: PingSample,
-        vehicle_id: str,
     ) -> None:
         self._result = result
         self._navigation = navigation
         self._imu = imu
         self._motions = motions
         self._mount = pings.T_base_sonar
-        self._vehicle_id = vehicle_id
         self._yaw: FloatArray | None = None
         self._delay_s = 0.0
         self._side_confidence = 1.0
@@ -136,12 +131,12 @@ class _Trial:
         elif fits[0].sign < 0:
             reading = self._handedness()
         if reading is None:
-            self._say_delays(find_delays(fits, lambda _: None, _SURE, _LIKELY))
+            self._say_delays(find_delays(fits, lambda _: None, SURE, _LIKELY))
             return
         if reading == _Reading():
             reading = self._velocity_side(reading)
         chosen = reading
-        delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), _SURE, _LIKELY)
+        delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), SURE, _LIKELY)
         fit = self._fit(chosen, delays.velocity_after_imu_s)
         self._result.is_velocity_judged = fit is not None
         if fit is not None and fit.is_mirrored:
@@ -150,7 +145,7 @@ class _Trial:
         if fit is not None:
             if not fit.is_mirrored:
                 self._judge_offset(fit)
-            judge_scale(self._result, fit, self._vehicle_id)
+            judge_scale(self._result, fit)
 
     def _fit(self, reading: _Reading, velocity_delay_s: float = 0.0) -> VelocityFit | None:
         assert self._yaw is not None
@@ -166,17 +161,6 @@ class _Trial:
             velocity_delay_s=velocity_delay_s,
         )
 
-    def _add(
-        self,
-        kind: str,
-        role: str,
-        detail: str,
-        confidence: float = 1.0,
-        **changes: str | float | bool,
-    ) -> None:
-        finding = Finding(kind, role, detail, confidence, vehicle_id=self._vehicle_id)
-        self._result.add(finding, **changes)
-
     def _judge_drift(self, fit: TurnFit, apart_rad_s: float) -> None:
         """Tell of a heading that drifts, unless its orientation does so less by `apart_rad_s`."""
         assert self._yaw is not None
@@ -185,7 +169,7 @@ class _Trial:
             return
         if abs(bias - apart_rad_s) < 0.5 * abs(bias):
             return  # beside an orientation that holds, the mapper's filter finds the bias
-        self._add(
+        self._result.tell(
             "imu_drift",
             "imu",
             f"it turns by {60.0 * abs(math.degrees(bias)):.1f} degrees a minute where the sonar's "
@@ -199,7 +183,7 @@ class _Trial:
     def _say_one_flipped(self, rates: int, orientation: int, fits: list[TurnFit]) -> None:
         sure = confidence_of(fits[0], fits[1])
         if orientation < 0:
-            self._add(
+            self._result.tell(
                 "imu_ned",
                 "imu",
                 "its yaw turns against its own rates and against the sonar's echoes: it is a "
@@ -208,7 +192,7 @@ class _Trial:
                 imu_orientation="ned",
             )
         if rates < 0:
-            self._add(
+            self._result.tell(
                 "imu_rates_frd",
                 "imu",
                 "its rates turn against its own yaw and against the sonar's echoes: their z axis "
@@ -224,8 +208,8 @@ class _Trial:
         sure = 0.5
         if sonar is not None and imu is not None:
             sure = confidence_of(sonar, imu)
-        if sonar is not None and sure > _SURE:
-            self._add(
+        if sonar is not None and sure > SURE:
+            self._result.tell(
                 "sonar_mirrored",
                 "sonar",
                 "its echoes turn against the imu and move sideways against the dvl: port and "
@@ -235,13 +219,13 @@ class _Trial:
                 sonar_is_mirrored=True,
             )
             return readings[0]
-        if imu is not None and sure < 1.0 - _SURE:
+        if imu is not None and sure < 1.0 - SURE:
             changes = {"imu_orientation": "ned", "imu_rates": "frd"}
             if self._imu.by_orientation is None:
                 del changes["imu_orientation"]
             if self._imu.by_rates is None:
                 del changes["imu_rates"]
-            self._add(
+            self._result.tell(
                 "imu_ned",
                 "imu",
                 "it turns against the sonar's echoes, which move as the dvl says: its axes are "
@@ -251,7 +235,7 @@ class _Trial:
                 **changes,
             )
             return readings[1]
-        self._add(
+        self._result.tell(
             "handedness",
             "",
             "the sonar's echoes turn against the imu, and the dvl cannot tell which of them "
@@ -271,12 +255,12 @@ class _Trial:
         if plain is None or mirrored is None:
             return reading
         self._side_confidence = confidence_of(mirrored, plain)
-        return other if self._side_confidence > _SURE else reading
+        return other if self._side_confidence > SURE else reading
 
     def _say_velocity_mirrored(self, fit: VelocityFit) -> None:
         offset = fit.yaw_rad
         axes = "exchanged" if abs(abs(offset) - 0.5 * math.pi) < 0.3 else "mirrored"
-        self._add(
+        self._result.tell(
             "dvl_mirrored",
             "velocity",
             f"its sideways velocity is against the sonar's echoes: its axes are {axes} "
@@ -298,7 +282,7 @@ class _Trial:
         by_velocity = abs(np.angle(mean)) + 0.05
         by_echoes = abs(np.angle(mean * np.exp(1j * offset)))
         if by_echoes > by_velocity:
-            self._add(
+            self._result.tell(
                 "sonar_turned",
                 "sonar",
                 f"its echoes move as if it were mounted {-degrees:.0f} degrees from where tf says "
@@ -307,7 +291,7 @@ class _Trial:
                 sonar_yaw_offset_rad=round(-offset, 4),
             )
         elif abs(abs(degrees) - 180.0) < 15.0:
-            self._add(
+            self._result.tell(
                 "dvl_sign",
                 "velocity",
                 "its velocity has the wrong sign: it is the bottom's against the vehicle "
@@ -316,7 +300,7 @@ class _Trial:
                 velocity_yaw_offset_rad=round(math.pi, 4),
             )
         else:
-            self._add(
+            self._result.tell(
                 "dvl_turned",
                 "velocity",
                 f"its velocity is {-degrees:.0f} degrees off the sonar's motion: it is mounted "
@@ -333,35 +317,31 @@ class _Trial:
         if delays.imu_s:
             # An orientation that is late by itself is put in time with the rates first.
             total_s = self._result.conventions.imu_delay_s + delays.imu_s
-            self._add(
+            self._result.tell(
                 "imu_delay",
                 "imu",
-                f"its stamps are {_late(delays.imu_s)} than those of sonar and dvl, by how the "
-                f"echoes turn{either.format('sonar')} (conventions.imu_delay_s: "
+                f"its stamps are {late_in_words(delays.imu_s)} than those of sonar and dvl, by "
+                f"how the echoes turn{either.format('sonar')} (conventions.imu_delay_s: "
                 f"{total_s:.2f})",
                 delays.confidence,
                 imu_delay_s=round(total_s, 3),
             )
         if delays.sonar_s:
-            self._add(
+            self._result.tell(
                 "sonar_delay",
                 "sonar",
-                f"its stamps are {_late(delays.sonar_s)} than the imu's, by how both turn"
+                f"its stamps are {late_in_words(delays.sonar_s)} than the imu's, by how both turn"
                 f"{either.format('imu')} (conventions.sonar_delay_s: {delays.sonar_s:.2f})",
                 delays.confidence,
                 sonar_delay_s=round(delays.sonar_s, 3),
             )
         if delays.velocity_s:
-            is_sure = delays.confidence > _SURE
-            self._add(
+            is_sure = delays.confidence > SURE
+            self._result.tell(
                 "velocity_delay",
                 "velocity",
-                f"its stamps are {_late(delays.velocity_s)} than those of sonar and imu, by how "
-                f"the echoes move (conventions.velocity_delay_s: {delays.velocity_s:.2f})",
+                f"its stamps are {late_in_words(delays.velocity_s)} than those of sonar and imu, "
+                f"by how the echoes move (conventions.velocity_delay_s: {delays.velocity_s:.2f})",
                 delays.confidence,
                 **({"velocity_delay_s": round(delays.velocity_s, 3)} if is_sure else {}),
             )
-
-
-def _late(delay_s: float) -> str:
-    return f"{abs(delay_s):.2f} s {'later' if delay_s > 0.0 else 'earlier'}"

@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.doctor.ping_motion import PingMotions
 from uw_dslam_ros2.core.doctor.sample import NavigationSample
 
 __all__ = [
+    "SURE",
     "TurnFit",
     "VelocityFit",
     "at_times",
@@ -32,7 +33,8 @@ _FLOOR_M = 0.01
 _STEP_S = 0.02
 _MAX_GAP_S = 1.5
 _ITERATIONS = 12
-_SURE = 0.99
+SURE = 0.99
+"""How sure a cause must be, to be mended unasked."""
 _MAX_TURN_COST = 1.5
 
 
@@ -138,7 +140,7 @@ def believed(fits: list[TurnFit]) -> list[TurnFit] | None:
     best, other = fits[0], fits[1]
     if not len(best.cost) or float(np.mean(best.cost)) > _MAX_TURN_COST:
         return None
-    return fits if confidence_of(best, other) > _SURE else None
+    return fits if confidence_of(best, other) > SURE else None
 
 
 def turn_bias(

@@ -4,43 +4,36 @@ from __future__ import annotations
 
 from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.sample import PingSample
-from uw_dslam_ros2.core.findings import Finding
 
 __all__ = ["judge_images"]
 
 
-def judge_images(result: Examination, pings: PingSample, vehicle_id: str) -> None:
+def judge_images(result: Examination, pings: PingSample) -> None:
     """Tell of images that hold something else than they are read as."""
     if pings.pixels == "power" and pings.pixels_read_as == "amplitude":
-        _say_power(result, vehicle_id)
+        _say_power(result)
     if pings.pixels == "decibel" and pings.pixels_read_as != "decibel":
-        _say_decibels(result, pings.db_per_count, vehicle_id)
+        _say_decibels(result, pings.db_per_count)
 
 
-def _say_power(result: Examination, vehicle_id: str) -> None:
-    result.add(
-        Finding(
-            "sonar_power",
-            "sonar",
-            "its pixels vary as an echo's power does, not its amplitude: read as amplitude they "
-            "give many false echoes (mapper.sonar.intensity: power)",
-            vehicle_id=vehicle_id,
-        )
+def _say_power(result: Examination) -> None:
+    result.tell(
+        "sonar_power",
+        "sonar",
+        "its pixels vary as an echo's power does, not its amplitude: read as amplitude they "
+        "give many false echoes (mapper.sonar.intensity: power)",
     )
     result.mended.add("sonar_power")
     result.sonar_changes["intensity"] = "power"
 
 
-def _say_decibels(result: Examination, db_per_count: float, vehicle_id: str) -> None:
-    result.add(
-        Finding(
-            "sonar_decibel",
-            "sonar",
-            "its pixels vary as much where they are dark as where they are bright, as the "
-            "logarithm of an echo does: read as amplitude they show no echo (mapper.sonar."
-            f"intensity: decibel, mapper.sonar.db_per_count: {db_per_count:.2g})",
-            vehicle_id=vehicle_id,
-        )
+def _say_decibels(result: Examination, db_per_count: float) -> None:
+    result.tell(
+        "sonar_decibel",
+        "sonar",
+        "its pixels vary as much where they are dark as where they are bright, as the "
+        "logarithm of an echo does: read as amplitude they show no echo (mapper.sonar."
+        f"intensity: decibel, mapper.sonar.db_per_count: {db_per_count:.2g})",
     )
     result.mended.add("sonar_decibel")
     result.sonar_changes |= {

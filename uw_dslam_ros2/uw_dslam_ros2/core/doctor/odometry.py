@@ -9,8 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.doctor.delays import late_in_words
 from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.fits import (
+    SURE,
     TurnFit,
     VelocityFit,
     believed,
@@ -28,7 +30,6 @@ __all__ = ["OdometrySample", "examine_odometry"]
 
 FloatArray = NDArray[np.float64]
 
-_SURE = 0.99
 _BELOW_M = 0.3
 _MIN_DELAY_S = 0.08
 _MIN_OFFSET_RAD = math.radians(4.0)
@@ -71,7 +72,6 @@ def examine_odometry(
     odometry: OdometrySample,
     motions: PingMotions,
     T_base_sonar: SE2,
-    vehicle_id: str = "",
     *,
     is_alone: bool = True,
 ) -> None:
@@ -80,7 +80,7 @@ def examine_odometry(
     One that `is_alone` is all the navigation that there is; then the sonar's clock, direction and
     scale are judged by it, too.
     """
-    _Judge(result, odometry, motions, T_base_sonar, vehicle_id).run(is_alone=is_alone)
+    _Judge(result, odometry, motions, T_base_sonar).run(is_alone=is_alone)
 
 
 class _Judge:
@@ -90,13 +90,11 @@ class _Judge:
         odometry: OdometrySample,
         motions: PingMotions,
         T_base_sonar: SE2,
-        vehicle_id: str,
     ) -> None:
         self._result = result
         self._odometry = odometry
         self._motions = motions
         self._mount = T_base_sonar
-        self._vehicle_id = vehicle_id
 
     def run(self, *, is_alone: bool) -> None:
         yaw = np.unwrap(self._odometry.yaw_rad)
@@ -133,17 +131,6 @@ class _Judge:
             self._judge_offset(fit)
             self._judge_scale(fit)
 
-    def _add(
-        self,
-        kind: str,
-        role: str,
-        detail: str,
-        confidence: float,
-        **changes: str | float | bool,
-    ) -> None:
-        finding = Finding(kind, role, detail, confidence, vehicle_id=self._vehicle_id)
-        self._result.add(finding, **changes)
-
     def _say_mirrored(self, confidence: float) -> Literal["odometry", "sonar"]:
         """Tell whether the odometry or the sonar is the wrong way round.
 
@@ -159,7 +146,7 @@ class _Judge:
                 "the sonar's echoes turn against it, and its z grows downwards", confidence
             )
         elif is_z_down is False:
-            self._add(
+            self._result.tell(
                 "sonar_mirrored",
                 "sonar",
                 "its echoes turn against the odometry, whose z grows upwards as it should: port "
@@ -170,7 +157,7 @@ class _Judge:
             )
             return "sonar"
         else:
-            self._add(
+            self._result.tell(
                 "handedness",
                 "odometry",
                 "the sonar's echoes turn against it: either it is north, east, down "
@@ -191,19 +178,18 @@ class _Judge:
             f"its poses are north, east, down: {why} (conventions.odometry: ned)",
             confidence,
             severity,
-            self._vehicle_id,
+            self._result.vehicle_id,
         )
         self._result.add(finding, odometry="ned")
 
     def _judge_delay(self, turns: list[TurnFit]) -> None:
         delay_s, sure = turns[0].delay_s, confidence_of(turns[0], turns[2])
-        if abs(delay_s) < _MIN_DELAY_S or sure < _SURE:
+        if abs(delay_s) < _MIN_DELAY_S or sure < SURE:
             return
-        late = f"{abs(delay_s):.2f} s {'later' if delay_s > 0.0 else 'earlier'}"
-        self._add(
+        self._result.tell(
             "sonar_delay",
             "sonar",
-            f"its stamps are {late} than the odometry's, by how both turn "
+            f"its stamps are {late_in_words(delay_s)} than the odometry's, by how both turn "
             f"(conventions.sonar_delay_s: {delay_s:.2f})",
             sure,
             sonar_delay_s=round(delay_s, 3),
@@ -213,7 +199,7 @@ class _Judge:
         sigma, offset = fit.factor_sigma / max(fit.scale, 1e-9), fit.yaw_rad
         if abs(offset) < max(_MIN_OFFSET_RAD, 4.0 * sigma) or sigma > _MAX_SIGMA:
             return
-        self._add(
+        self._result.tell(
             "sonar_turned",
             "sonar",
             f"its echoes move as if it were mounted {-math.degrees(offset):.0f} degrees from "
@@ -226,7 +212,7 @@ class _Judge:
     def _judge_scale(self, fit: VelocityFit) -> None:
         if not is_scale_wrong(fit):
             return
-        self._add(
+        self._result.tell(
             "sound_speed",
             "sonar",
             f"its echoes move {fit.scale:.3g} times as far as the odometry says: one of them is "

@@ -6,7 +6,6 @@ import math
 
 from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.fits import VelocityFit
-from uw_dslam_ros2.core.findings import Finding
 
 __all__ = ["confidence_in", "is_scale_wrong", "judge_scale"]
 
@@ -27,62 +26,53 @@ def is_scale_wrong(fit: VelocityFit) -> bool:
     return error >= _MIN_SCALE_ERROR and error - 2.0 * fit.factor_sigma >= _USUAL_SCALE_ERROR
 
 
-def judge_scale(result: Examination, fit: VelocityFit, vehicle_id: str) -> None:
+def judge_scale(result: Examination, fit: VelocityFit) -> None:
     """Tell of a DVL whose unit or scale, or a sonar whose speed of sound, is wrong."""
     if not is_scale_wrong(fit):
         return
     if not 1.0 / _UNIT_SCALE < fit.scale < _UNIT_SCALE:
-        _say_unit(result, fit.scale, vehicle_id)
+        _say_unit(result, fit.scale)
         return
     error = abs(fit.scale - 1.0)
     confidence = confidence_in(error - 0.5 * _MIN_SCALE_ERROR, fit.factor_sigma)
     # Only the ratio shows. Instruments are set for the sea, 1500 m/s; colder or fresher water
     # makes one that is not set for it measure too long, and hardly any water too short.
     if fit.scale > 1.0:
-        result.add(
-            Finding(
-                "sound_speed",
-                "sonar",
-                f"its echoes move {100.0 * (fit.scale - 1.0):.1f} % farther than the dvl says, as "
-                "with a speed of sound that is too high for colder or fresher water "
-                f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f}); or the dvl's scale is "
-                f"too small (conventions.velocity_scale: {fit.scale:.3f} instead)",
-                confidence,
-                vehicle_id=vehicle_id,
-            ),
+        result.tell(
+            "sound_speed",
+            "sonar",
+            f"its echoes move {100.0 * (fit.scale - 1.0):.1f} % farther than the dvl says, as "
+            "with a speed of sound that is too high for colder or fresher water "
+            f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f}); or the dvl's scale is "
+            f"too small (conventions.velocity_scale: {fit.scale:.3f} instead)",
+            confidence,
             sonar_range_scale=round(1.0 / fit.scale, 4),
         )
         return
-    result.add(
-        Finding(
-            "dvl_scale",
-            "velocity",
-            f"its way is {100.0 * (1.0 / fit.scale - 1.0):.1f} % longer than the sonar's echoes "
-            "move, as with a speed of sound that is too high for colder or fresher water "
-            f"(conventions.velocity_scale: {fit.scale:.3f}); or the sonar's is too low "
-            f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f} instead)",
-            confidence,
-            vehicle_id=vehicle_id,
-        ),
+    result.tell(
+        "dvl_scale",
+        "velocity",
+        f"its way is {100.0 * (1.0 / fit.scale - 1.0):.1f} % longer than the sonar's echoes "
+        "move, as with a speed of sound that is too high for colder or fresher water "
+        f"(conventions.velocity_scale: {fit.scale:.3f}); or the sonar's is too low "
+        f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f} instead)",
+        confidence,
         velocity_scale=round(fit.scale, 4),
     )
 
 
-def _say_unit(result: Examination, scale: float, vehicle_id: str) -> None:
+def _say_unit(result: Examination, scale: float) -> None:
     name, unit = min(_UNITS.items(), key=lambda item: abs(math.log(scale / item[1])))
     is_unit = abs(math.log(scale / unit)) < _UNIT_TOLERANCE
     factor = unit if is_unit else scale
     other = f"conventions.sonar_range_scale: {1.0 / scale:.4g} instead"
     said = f": it is in {name}" if is_unit else ""
     mend = "" if is_unit else f"; if it is the sonar's ranges that are wrong, {other}"
-    result.add(
-        Finding(
-            "dvl_unit",
-            "velocity",
-            f"its velocity is {1.0 / scale:.3g} times that of the sonar's echoes{said} "
-            f"(conventions.velocity_scale: {factor:.4g}{mend})",
-            vehicle_id=vehicle_id,
-        ),
+    result.tell(
+        "dvl_unit",
+        "velocity",
+        f"its velocity is {1.0 / scale:.3g} times that of the sonar's echoes{said} "
+        f"(conventions.velocity_scale: {factor:.4g}{mend})",
         velocity_scale=float(f"{factor:.4g}"),
     )
 

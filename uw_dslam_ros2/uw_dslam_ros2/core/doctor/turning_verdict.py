@@ -9,7 +9,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.doctor.delays import late_in_words
 from uw_dslam_ros2.core.doctor.examination import Examination
+from uw_dslam_ros2.core.doctor.fits import SURE
 from uw_dslam_ros2.core.doctor.imu import compare_yaw_and_rate
 from uw_dslam_ros2.core.doctor.sample import NavigationSample
 from uw_dslam_ros2.core.doctor.turning import (
@@ -18,13 +20,11 @@ from uw_dslam_ros2.core.doctor.turning import (
     TurningTrial,
     choose_windows,
 )
-from uw_dslam_ros2.core.findings import Finding
 
 __all__ = ["choose_spans", "examine_turning"]
 
 FloatArray = NDArray[np.float64]
 
-_SURE = 0.99
 _SHARED = 1.5
 """Windows overlap by half, so that so many of them count as one."""
 _MIN_OFFSET_RAD, _SIGMAS = math.radians(4.0), 4.0
@@ -36,7 +36,6 @@ def examine_turning(
     navigation: NavigationSample,
     beams: BeamSample,
     spans: Sequence[tuple[float, float]],
-    vehicle_id: str = "",
 ) -> None:
     """Add to an examination what the beams (N,) say: direction, zero, and the heading's delay.
 
@@ -55,7 +54,7 @@ def examine_turning(
     trial = TurningTrial(beams, navigation, yaw, spans)
     result.num_turning_windows = trial.num_windows
     if trial.num_windows:
-        _Judge(result, trial, navigation, vehicle_id).run()
+        _Judge(result, trial, navigation).run()
 
 
 def choose_spans(navigation: NavigationSample, ping_s: FloatArray) -> list[tuple[float, float]]:
@@ -97,26 +96,18 @@ class _Judge:
         result: Examination,
         trial: TurningTrial,
         navigation: NavigationSample,
-        vehicle_id: str,
     ) -> None:
         self._result, self._trial = result, trial
         self._velocity_m_s = navigation.velocity_m_s
-        self._vehicle_id = vehicle_id
 
     def run(self) -> None:
         best, other = sorted((self._trial.best(1), self._trial.best(-1)), key=lambda f: -f.mean)
-        if best.reading.side < 0 and confidence_of(best, other) < _SURE:
+        if best.reading.side < 0 and confidence_of(best, other) < SURE:
             best = other  # what is usual stays until it is clearly wrong
         if best.reading.side < 0:
             self._judge_side(best, other)
         self._judge_offset(best)
         self._judge_delay(best)
-
-    def _add(
-        self, kind: str, role: str, detail: str, confidence: float, **changes: str | float | bool
-    ) -> None:
-        finding = Finding(kind, role, detail, confidence, vehicle_id=self._vehicle_id)
-        self._result.add(finding, **changes)
 
     def _judge_side(self, best: TurningFit, other: TurningFit) -> None:
         """Turns run backwards, or it is the heading that does: the sideways velocity tells."""
@@ -124,8 +115,8 @@ class _Judge:
         reading = best.reading
         seen = replace(reading, side=1, heading=-1, offset_rad=-reading.offset_rad)
         by_heading = self._trial.refined(seen)
-        if confidence_of(by_heading, best) > _SURE:
-            self._add(
+        if confidence_of(by_heading, best) > SURE:
+            self._result.tell(
                 "imu_ned",
                 "imu",
                 "it turns against the sonar's turns, which agree with one another and with the "
@@ -136,8 +127,8 @@ class _Judge:
                 imu_rates="frd",
             )
             return
-        doubt = confidence_of(best, by_heading) < _SURE
-        self._add(
+        doubt = confidence_of(best, by_heading) < SURE
+        self._result.tell(
             "sonar_mirrored",
             "sonar",
             "its turns meet one another only if they run the other way: its angles grow clockwise "
@@ -159,7 +150,7 @@ class _Judge:
             return
         usual = self._trial.score(replace(best.reading, offset_rad=0.0))
         sure = confidence_of(best, usual)
-        if sure < _SURE:
+        if sure < SURE:
             return
         degrees = math.degrees(offset)
         mean = complex(*np.median(self._velocity_m_s, axis=0))
@@ -167,7 +158,7 @@ class _Judge:
         by_velocity = abs(np.angle(mean)) + 0.05
         by_echoes = abs(np.angle(mean * np.exp(-1j * offset)))
         if by_echoes > by_velocity:
-            self._add(
+            self._result.tell(
                 "sonar_turned",
                 "sonar",
                 f"its turns meet one another only if its zero is {degrees:.0f} degrees from where "
@@ -177,7 +168,7 @@ class _Judge:
                 sonar_yaw_offset_rad=round(offset, 4),
             )
         elif abs(abs(degrees) - 180.0) < 15.0:
-            self._add(
+            self._result.tell(
                 "dvl_sign",
                 "velocity",
                 "its velocity has the wrong sign: it is the bottom's against the vehicle "
@@ -186,7 +177,7 @@ class _Judge:
                 velocity_yaw_offset_rad=round(math.pi, 4),
             )
         else:
-            self._add(
+            self._result.tell(
                 "dvl_turned",
                 "velocity",
                 f"its velocity is {degrees:.0f} degrees off the sonar's motion: it is mounted "
@@ -201,13 +192,12 @@ class _Judge:
         known_s = self._result.conventions.imu_delay_s
         still = self._trial.score(replace(best.reading, delay_s=known_s))
         sure = confidence_of(best, still)
-        if abs(delay_s - known_s) < _MIN_DELAY_S or sure < _SURE:
+        if abs(delay_s - known_s) < _MIN_DELAY_S or sure < SURE:
             return
-        way = "later" if delay_s > 0.0 else "earlier"
-        self._add(
+        self._result.tell(
             "imu_delay",
             "imu",
-            f"its stamps are {abs(delay_s):.2f} s {way} than the sonar's, by where the walls lie "
+            f"its stamps are {late_in_words(delay_s)} than the sonar's, by where the walls lie "
             f"while the vehicle turns (conventions.imu_delay_s: {delay_s:.2f})",
             sure,
             imu_delay_s=round(delay_s, 3),
