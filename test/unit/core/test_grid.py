@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap, bounds_of, strips_of
 from uw_dslam_ros2.core.se2 import SE2
 
 
@@ -56,3 +56,32 @@ def test_an_occupancy_map_cannot_be_written_to():
     occupancy = OccupancyMap(GridSpec(1.0, 1, 2), np.array([[0, 100]], dtype=np.int8))
     with pytest.raises(ValueError, match="read-only"):
         occupancy.values[0, 0] = 3
+
+
+@pytest.mark.parametrize("num_rows", [0, 1, 255, 256, 257, 1000])
+@pytest.mark.parametrize("margin", [0, 7])
+def test_strips_have_each_row_once_and_what_is_around_it(num_rows, margin):
+    rows = np.arange(num_rows)
+    strips = strips_of(num_rows, margin)
+    assert np.concatenate([rows[:0], *(rows[s.rows] for s in strips)]).tolist() == rows.tolist()
+    for strip in strips:
+        around = rows[strip.around]
+        assert around[strip.inside].tolist() == rows[strip.rows].tolist()
+        assert around[0] == max(0, strip.rows.start - margin)
+        assert around[-1] == min(num_rows, strip.rows.stop + margin) - 1
+
+
+def test_bounds_hold_all_that_is_set_and_no_row_more():
+    mask = np.zeros((9, 12), bool)
+    assert bounds_of(mask) is None
+    mask[3, 4] = mask[6, 2] = True
+    assert bounds_of(mask) == (slice(3, 7), slice(2, 5))
+
+
+def test_a_part_of_a_grid_has_its_cells_where_they_were():
+    spec = GridSpec(0.2, 30, 40, SE2(5.0, -3.0, 0.7))
+    part = spec.part(-4, 6, 8, 9)
+    cells = np.argwhere(np.ones(part.shape))
+    np.testing.assert_allclose(
+        part.centers_of(cells), spec.centers_of(cells + np.array([-4, 6])), atol=1e-12
+    )

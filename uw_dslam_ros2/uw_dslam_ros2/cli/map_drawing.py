@@ -19,7 +19,7 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.outcome import Trajectory
-from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.metrics import ends_of_rows
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -103,12 +103,11 @@ def set_title(axes: Axes, text: str, warning: str = "") -> None:
 
 def cropped(occupancy: OccupancyMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last (exclusive) cell of what is known, with a margin."""
-    known = occupancy.known
-    seen = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
-    if len(seen[0]) == 0:
+    box = bounds_of(occupancy.known)
+    if box is None:
         return np.zeros(2, np.int64), np.array(occupancy.spec.shape)
-    low = np.maximum([along[0] - _MARGIN_CELLS for along in seen], 0)
-    high = np.minimum([along[-1] + 1 + _MARGIN_CELLS for along in seen], occupancy.spec.shape)
+    low = np.maximum([along.start - _MARGIN_CELLS for along in box], 0)
+    high = np.minimum([along.stop + _MARGIN_CELLS for along in box], occupancy.spec.shape)
     return low, high
 
 
@@ -302,6 +301,4 @@ def common_spec(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2
     own = ends_of_rows(target.known)
     every = np.concatenate([cells, own]) if len(own) else cells
     low, high = every.min(axis=0) - _MARGIN_CELLS, every.max(axis=0) + 1 + _MARGIN_CELLS
-    resolution = target.spec.resolution_m
-    corner = target.spec.T_frame_grid @ SE2(low[1] * resolution, low[0] * resolution)
-    return GridSpec(resolution, int(high[0] - low[0]), int(high[1] - low[1]), corner)
+    return target.spec.part(*low.tolist(), *(high - low).tolist())

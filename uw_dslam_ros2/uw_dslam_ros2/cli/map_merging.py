@@ -18,7 +18,7 @@ import numpy as np
 from uw_dslam_ros2.cli.mapping import Counter, OfflineConfig, settle
 from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.merging import MapProvenance, MapQueue, MapQueueConfig, SubmapRecord
 from uw_dslam_ros2.core.merging.global_map import pinned_lattice
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
@@ -232,11 +232,10 @@ def _inverted(result: RegistrationResult) -> RegistrationResult:
 
 def _known_box(occupancy: OccupancyMap) -> tuple[np.ndarray, np.ndarray]:
     """First and last (exclusive) cell [row, col] of what is known; all where nothing is."""
-    known = occupancy.known
-    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-    if len(rows) == 0:
+    box = bounds_of(occupancy.known)
+    if box is None:
         return np.zeros(2, np.int64), np.array(occupancy.spec.shape)
-    return np.array([rows[0], cols[0]]), np.array([rows[-1], cols[-1]]) + 1
+    return np.array([along.start for along in box]), np.array([along.stop for along in box])
 
 
 def _in_frame_of_first(

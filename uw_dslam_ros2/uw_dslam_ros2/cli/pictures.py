@@ -48,7 +48,7 @@ from uw_dslam_ros2.cli.map_drawing import (
 )
 from uw_dslam_ros2.cli.outcome import Outcome
 from uw_dslam_ros2.cli.scoring import Scores, Truth
-from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import OccupancyMap, bounds_of, strips_of
 from uw_dslam_ros2.core.merging import ConstraintKind, SubmapState
 from uw_dslam_ros2.core.metrics import interpolate_poses, resample
 from uw_dslam_ros2.core.se2 import SE2
@@ -66,7 +66,6 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 DECIDED_COLOR = "#5b2a86"
 _COMPARED = (UNKNOWN_COLOR, SEEN_COLOR, FREE_COLOR, MISSING_COLOR, AGREE_COLOR, EXTRA_COLOR)
-_STRIP_ROWS = 256
 _UNKNOWN, _SEEN, _FREE, _MISSING, _AGREE, _EXTRA = range(len(_COMPARED))
 
 
@@ -256,11 +255,7 @@ def truth_comparison(outcome: Outcome, truth: Truth, scores: Scores) -> Figure |
     tolerance_cells = 0.25 / spec.resolution_m
     shown = np.full(spec.shape, _UNKNOWN, np.uint8)
     reach = math.ceil(tolerance_cells) + 1
-    # By strips: what is worked out on the way would take several times the room of the picture.
-    for first in range(0, spec.num_rows, _STRIP_ROWS):
-        low, last = max(0, first - reach), first + _STRIP_ROWS
-        own, around = slice(first, last), slice(low, last + reach)
-        inside = slice(first - low, last - low)
+    for own, around, inside in strips_of(spec.num_rows, reach):
         near_true = near_walls(true[around] > 50, tolerance_cells)[inside]
         near_found = near_walls(found[around] > 50, tolerance_cells)[inside]
         strip, walls, true_walls = shown[own], found[own] > 50, true[own] > 50
@@ -315,14 +310,11 @@ def overlay(
 ) -> Figure:
     """Lay a source map on a target map, as the view does: where walls agree, and where not."""
     pair = lay_on(target, source, T_target_source)
-    known = (pair.target >= 0) | (pair.source >= 0)
-    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-    low = np.array([rows[0], cols[0]]) if len(rows) else np.zeros(2, np.int64)
-    high = np.array([rows[-1], cols[-1]]) + 1 if len(rows) else np.array(pair.spec.shape)
-    resolution_m = pair.spec.resolution_m
-    corner = pair.spec.T_frame_grid @ SE2(low[1] * resolution_m, low[0] * resolution_m)
-    spec = GridSpec(resolution_m, int(high[0] - low[0]), int(high[1] - low[1]), corner)
-    rgba = pair.agreement()[low[0] : high[0], low[1] : high[1]]
+    rgba, spec = pair.agreement(), pair.spec
+    box = bounds_of((pair.target >= 0) | (pair.source >= 0))
+    if box is not None:
+        rgba = rgba[box]
+        spec = spec.part(box[0].start, box[1].start, *rgba.shape[:2])
     picture = np.where(rgba[:, :, 3:] > 0, rgba[:, :, :3], to_bytes(UNKNOWN_COLOR))
     figure, axes = single_map(spec)
     show_picture(axes, picture.astype(np.uint8), spec)

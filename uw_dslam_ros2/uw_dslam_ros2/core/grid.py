@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +23,10 @@ __all__ = [
     "UNSEEN",
     "GridSpec",
     "OccupancyMap",
+    "Strip",
+    "bounds_of",
     "percent_table",
+    "strips_of",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -34,6 +39,8 @@ UNITS_PER_NAT = 1000.0
 
 MAX_MAP_SIDE = 20_000
 """Rows and columns of the largest map that is made whole: to be shown, sent, written, matched."""
+
+_STRIP_ROWS = 256
 
 UNSEEN = np.int16(-32768)
 """Instead of log-odds: nothing was observed."""
@@ -90,6 +97,11 @@ class GridSpec:
         """Which cells (N, 2) lie inside the grid."""
         inside = (cells >= 0) & (cells < np.array(self.shape))
         return inside.all(axis=-1)
+
+    def part(self, row: int, col: int, num_rows: int, num_cols: int) -> GridSpec:
+        """The cells from one on, in the same frame; it may reach beyond the grid."""
+        corner = self.T_frame_grid @ SE2(col * self.resolution_m, row * self.resolution_m)
+        return GridSpec(self.resolution_m, num_rows, num_cols, corner)
 
     def corners(self) -> FloatArray:
         """Outer corners (4, 2) [m], counter-clockwise from that of cell (0, 0)."""
@@ -148,3 +160,32 @@ def percent_table(log_odds_max: float) -> NDArray[np.int8]:
     # A table instead of millions of exponentials.
     percent = 100.0 / (1.0 + np.exp(-np.arange(-limit, limit + 1) / UNITS_PER_NAT))
     return np.rint(percent).astype(np.int8)
+
+
+def bounds_of(mask: NDArray[np.bool_]) -> tuple[slice, slice] | None:
+    """Rows and columns that hold all set cells (R, C); None without any."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return None
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+class Strip(NamedTuple):
+    """Some rows, those around them that count for them, and where among these they are."""
+
+    rows: slice
+    around: slice
+    inside: slice
+
+
+def strips_of(num_rows: int, margin: int = 0) -> list[Strip]:
+    """Rows in parts of about the same height.
+
+    What is worked out of a whole map on the way takes many times the map's room.
+    """
+    edges = np.linspace(0, num_rows, 1 + -(-num_rows // _STRIP_ROWS)).astype(int).tolist()
+    strips = []
+    for first, last in itertools.pairwise(edges):
+        low, high = max(first - margin, 0), min(last + margin, num_rows)
+        strips.append(Strip(slice(first, last), slice(low, high), slice(first - low, last - low)))
+    return strips

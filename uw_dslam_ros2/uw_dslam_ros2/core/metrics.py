@@ -6,7 +6,6 @@ vehicles. `trajectory_error` finds it from the trajectories; maps are compared u
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from skimage.metrics import structural_similarity
 from skimage.morphology import skeletonize
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap, strips_of
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 __all__ = [
@@ -40,7 +39,6 @@ BoolArray = NDArray[np.bool_]
 Trajectory = tuple[IntArray, FloatArray]
 """Stamps (K,) [ns], rising, and poses (K, 3) [x, y, yaw] in metres and radians."""
 
-_STRIP_ROWS = 256
 _SSIM_WINDOW = 7
 
 
@@ -193,19 +191,13 @@ def resample(
     cos, sin = ratio * math.cos(T_grids.yaw), ratio * math.sin(T_grids.yaw)
     x_0, y_0 = T_grids.x / own.resolution_m, T_grids.y / own.resolution_m
     values = np.full(spec.shape, -1, dtype=np.int8)
-    for strip in _strips(spec.num_rows):
+    for strip, *_ in strips_of(spec.num_rows):
         steps = steps_row[strip, None]
         cols = np.floor((x_0 + cos * steps_col)[None] - sin * steps).astype(np.int32)
         rows = np.floor((y_0 + sin * steps_col)[None] + cos * steps).astype(np.int32)
         is_inside = (rows >= 0) & (rows < own.shape[0]) & (cols >= 0) & (cols < own.shape[1])
         values[strip][is_inside] = occupancy.values[rows[is_inside], cols[is_inside]]
     return values
-
-
-def _strips(num_rows: int) -> list[slice]:
-    """Rows in parts of about the same height: as floats, a whole map would take much room."""
-    edges = np.linspace(0, num_rows, 1 + -(-num_rows // _STRIP_ROWS)).astype(int).tolist()
-    return [slice(first, last) for first, last in itertools.pairwise(edges)]
 
 
 def compare_maps(
@@ -320,13 +312,11 @@ def _picture_errors(
     """Mean squared difference and mean structural similarity of two maps as pictures."""
     chosen, margin = _interior(counts), _SSIM_WINDOW // 2
     squares = similarities = 0.0
-    for strip in _strips(len(found)):
-        low, high = max(strip.start - margin, 0), min(strip.stop + margin, len(found))
-        picture, true_picture = _picture(found[low:high]), _picture(true[low:high])
+    for strip, around, inside in strips_of(len(found), margin):
+        picture, true_picture = _picture(found[around]), _picture(true[around])
         _, similarity = structural_similarity(
             picture, true_picture, win_size=_SSIM_WINDOW, data_range=1.0, full=True
         )
-        inside = slice(strip.start - low, strip.stop - low)
         difference = (picture - true_picture)[inside][counts[strip]]
         squares += float((difference**2).sum())
         similarities += float(similarity[inside][chosen[strip]].sum())

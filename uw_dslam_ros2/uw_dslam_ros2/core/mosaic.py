@@ -16,7 +16,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import UNKNOWN, UNSEEN, GridSpec, OccupancyMap, percent_table
+from uw_dslam_ros2.core.grid import (
+    UNKNOWN,
+    UNSEEN,
+    GridSpec,
+    OccupancyMap,
+    percent_table,
+    strips_of,
+)
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["SQUARE", "Drawable", "Mosaic", "Window", "fuse_maps"]
@@ -24,7 +31,6 @@ __all__ = ["SQUARE", "Drawable", "Mosaic", "Window", "fuse_maps"]
 SQUARE = 256
 """Cells are kept in squares of so many rows and columns."""
 _UNSEEN = int(UNSEEN)
-_STRIP_ROWS = 256
 
 
 class Drawable(Protocol):
@@ -231,7 +237,7 @@ class Mosaic:
         # Sets that a later grid has covered wholly are used by no cell any more.
         is_used = np.zeros(len(sets), np.bool_)
         is_used[0] = True
-        strips = [owners[row : row + _STRIP_ROWS] for row in range(0, len(owners), _STRIP_ROWS)]
+        strips = [owners[strip.rows] for strip in strips_of(len(owners))]
         for strip in strips:  # counting takes eight bytes a cell
             is_used |= np.bincount(strip.ravel(), minlength=len(sets)) > 0
         packed = (np.cumsum(is_used) - 1).astype(np.uint32)

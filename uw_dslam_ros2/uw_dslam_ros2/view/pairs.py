@@ -163,8 +163,7 @@ def lay_on(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> 
     size = np.array([spec.num_cols, spec.num_rows])
     high = np.ceil(np.maximum(corners.max(axis=0), size)).astype(int) + _MARGIN_CELLS
     window = Window(int(low[1]), int(low[0]), int(high[1]), int(high[0]))
-    corner = SE2(window.col_0 * spec.resolution_m, window.row_0 * spec.resolution_m)
-    laid = GridSpec(spec.resolution_m, *window.shape, spec.T_frame_grid @ corner)
+    laid = spec.part(window.row_0, window.col_0, *window.shape)
     own = np.full(laid.shape, UNKNOWN, np.int8)
     own[
         -window.row_0 : spec.num_rows - window.row_0, -window.col_0 : spec.num_cols - window.col_0

@@ -13,7 +13,7 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mosaic import SQUARE, Window
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["TILE_PIXELS", "Layer", "bounds_of", "colours_of_percent", "png_bytes", "tile_png"]
+__all__ = ["TILE_PIXELS", "Layer", "colours_of_percent", "png_bytes", "rectangle_of", "tile_png"]
 
 ByteArray = NDArray[np.uint8]
 
@@ -115,7 +115,7 @@ class Layer:
         return np.asarray(cells[row - first[0] * SQUARE, col - first[1] * SQUARE])
 
     def bounds(self) -> tuple[float, float, float, float] | None:
-        """Rectangle around all squares on the page, as `bounds_of`; None without any."""
+        """Rectangle around all squares on the page, as `rectangle_of`; None without any."""
         if not self._known[0]:
             return None
         rows, cols = np.array(sorted(self._known[0])).T * SQUARE
@@ -123,11 +123,9 @@ class Layer:
         return self.bounds_of_cells(Window(*low, high[0] + SQUARE, high[1] + SQUARE))
 
     def bounds_of_cells(self, window: Window) -> tuple[float, float, float, float]:
-        """Rectangle around a rectangle of cells on the page, as `bounds_of`."""
-        resolution_m = self.lattice.resolution_m
-        corner = SE2(window.col_0 * resolution_m, window.row_0 * resolution_m)
-        spec = GridSpec(resolution_m, *window.shape, self.lattice.T_frame_grid @ corner)
-        return bounds_of(spec, self.T_view_map)
+        """Rectangle around a rectangle of cells on the page, as `rectangle_of`."""
+        spec = self.lattice.part(window.row_0, window.col_0, *window.shape)
+        return rectangle_of(spec, self.T_view_map)
 
     def _squares(self, level: int) -> set[tuple[int, int]]:
         while len(self._known) <= level:
@@ -153,7 +151,7 @@ class Layer:
         return self._made[key]
 
 
-def bounds_of(spec: GridSpec, T_view_frame: SE2) -> tuple[float, float, float, float]:
+def rectangle_of(spec: GridSpec, T_view_frame: SE2) -> tuple[float, float, float, float]:
     """Rectangle around a grid, ``x_min, y_min, x_max, y_max`` [m]."""
     corners = T_view_frame.apply(spec.corners())
     low, high = corners.min(axis=0), corners.max(axis=0)

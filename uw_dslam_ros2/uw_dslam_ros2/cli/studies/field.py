@@ -182,13 +182,7 @@ def _lattice(pair: MapPair) -> GridSpec:
     """A lattice around the target that holds the source wherever it touches the target."""
     spec = pair.target.spec
     margin = max(pair.source.spec.shape)
-    corner = SE2(-margin * spec.resolution_m, -margin * spec.resolution_m, 0.0)
-    return GridSpec(
-        spec.resolution_m,
-        spec.num_rows + 2 * margin,
-        spec.num_cols + 2 * margin,
-        spec.T_frame_grid @ corner,
-    )
+    return spec.part(-margin, -margin, *(side + 2 * margin for side in spec.shape))
 
 
 def _merged(pair: MapPair, T_target_source: SE2 | None) -> OccupancyMap:

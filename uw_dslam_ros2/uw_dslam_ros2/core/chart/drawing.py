@@ -19,9 +19,9 @@ from uw_dslam_ros2.core.chart.refine import (
     refine_tracks,
 )
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNKNOWN, GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.occupancy import SIGHT_CELLS, GrowingGrid, box_of
+from uw_dslam_ros2.core.mapping.occupancy import SIGHT_CELLS, GrowingGrid
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -166,7 +166,7 @@ def _meet(reach: Window, block: Window) -> bool:
 
 def _trimmed(whole: Window, values: NDArray[np.int8], resolution_m: float) -> OccupancyMap:
     """What is known, at least one cell."""
-    box = box_of(values != UNKNOWN)
+    box = bounds_of(values != UNKNOWN)
     row, col = (0, 0) if box is None else (whole.row_0 + box[0].start, whole.col_0 + box[1].start)
     known = np.full((1, 1), UNKNOWN, np.int8) if box is None else values[box].copy()
     corner = SE2(col * resolution_m, row * resolution_m)

@@ -17,7 +17,9 @@ from uw_dslam_ros2.core.grid import (
     UNSEEN,
     GridSpec,
     OccupancyMap,
+    bounds_of,
     percent_table,
+    strips_of,
 )
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.mapping.grid_kernels import (
@@ -30,7 +32,7 @@ from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import Detections
 
-__all__ = ["SIGHT_CELLS", "CompressedGrid", "GrowingGrid", "LogOddsGrid", "box_of"]
+__all__ = ["SIGHT_CELLS", "CompressedGrid", "GrowingGrid", "LogOddsGrid"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -54,7 +56,6 @@ SIGHT_CELLS = _TAIL_REACH_CELLS + _MARGIN_CELLS
 
 # Growing means copying everything, so it goes in long steps.
 _TILE = 256
-_BAND_ROWS = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +84,7 @@ class LogOddsGrid:
 
     def trimmed(self) -> LogOddsGrid:
         """A copy of the observed part, at least one cell."""
-        window = box_of(self.observed)
+        window = bounds_of(self.observed)
         if window is None:
             return _nothing(self.resolution_m)
         return LogOddsGrid(
@@ -137,14 +138,6 @@ def _percent(
 ) -> NDArray[np.int8]:
     limit = len(table) // 2
     return np.where(observed, table[np.clip(log_odds, -limit, limit) + limit], np.int8(UNKNOWN))
-
-
-def box_of(mask: BoolArray) -> tuple[slice, slice] | None:
-    """Rows and columns of a rectangle around all that is set."""
-    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if len(rows) == 0:
-        return None
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
 
 
 def _nothing(resolution_m: float) -> LogOddsGrid:
@@ -225,52 +218,47 @@ class GrowingGrid:
 
     def trimmed(self) -> LogOddsGrid:
         """The observed part as a map, at least one cell."""
-        row, col, shape = self._reached()
+        reached, window = self._reached()
+        shape, resolution_m = reached.shape, self._config.resolution_m
         log_odds, observed = np.zeros(shape, np.int32), np.zeros(shape, np.bool_)
-        for rows, *band in self._bands():
+        for rows, *band in self._bands(window):
             log_odds[rows], observed[rows] = band
-        resolution_m = self._config.resolution_m
-        return LogOddsGrid(log_odds, observed, row, col, resolution_m).trimmed()
+        return LogOddsGrid(
+            log_odds, observed, reached.row_0, reached.col_0, resolution_m
+        ).trimmed()
 
     def percent(self, log_odds_max: float) -> tuple[Window, NDArray[np.int8]]:
         """Probability in percent, -1 where nothing was observed, of the lattice cells reached."""
-        row, col, shape = self._reached()
-        values, table = np.full(shape, UNKNOWN, np.int8), percent_table(log_odds_max)
-        for rows, log_odds, observed in self._bands():
+        reached, window = self._reached()
+        values, table = np.full(reached.shape, UNKNOWN, np.int8), percent_table(log_odds_max)
+        for rows, log_odds, observed in self._bands(window):
             values[rows] = _percent(log_odds, observed, table)
-        return Window(row, col, row + shape[0], col + shape[1]), values
+        return reached, values
 
-    def _reached(self) -> tuple[int, int, tuple[int, int]]:
-        """Lattice cell where all that can be drawn begins, and its rows and columns."""
-        rows, cols = self._window()
-        shape = rows.stop - rows.start, cols.stop - cols.start
-        return self._row + rows.start, self._col + cols.start, shape
+    def _reached(self) -> tuple[Window, tuple[slice, slice]]:
+        """Where all that can be drawn lies: on the lattice, and in the arrays."""
+        box = bounds_of((self._echoes > 0) | (self._water > 0))
+        rows, cols = box or (slice(0, 0), slice(0, 0))
+        if box is not None:
+            # A heap of echoes is wider than the cells that they lie in.
+            rows, cols = (
+                slice(max(0, own.start - _MARGIN_CELLS), min(num, own.stop + _MARGIN_CELLS))
+                for own, num in zip(box, self._echoes.shape, strict=True)
+            )
+        row, col = self._row, self._col
+        reached = Window(row + rows.start, col + cols.start, row + rows.stop, col + cols.stop)
+        return reached, (rows, cols)
 
-    def _window(self) -> tuple[slice, slice]:
-        box = box_of((self._echoes > 0) | (self._water > 0))
-        if box is None:
-            return slice(0, 0), slice(0, 0)
-        # A heap of echoes is wider than the cells that they lie in.
-        rows, cols = (
-            slice(max(0, own.start - _MARGIN_CELLS), min(num, own.stop + _MARGIN_CELLS))
-            for own, num in zip(box, self._echoes.shape, strict=True)
-        )
-        return rows, cols
-
-    def _bands(self) -> Iterator[tuple[slice, NDArray[np.int32], BoolArray]]:
-        """What is drawn, by bands of rows: which, their log-odds, and what of them is observed.
-
-        What of a large map is needed on the way to that is many times as large.
-        """
-        window, cols = self._window()
+    def _bands(
+        self, window: tuple[slice, slice]
+    ) -> Iterator[tuple[slice, NDArray[np.int32], BoolArray]]:
+        """What is drawn, by bands of rows: which, their log-odds, and what of them is observed."""
         free = self._config.free_log_odds * UNITS_PER_NAT
-        for first in range(window.start, window.stop, _BAND_ROWS):
-            last = min(first + _BAND_ROWS, window.stop)
-            low = max(window.start, first - SIGHT_CELLS)
-            around = slice(low, min(window.stop, last + SIGHT_CELLS))
+        echoes, water = self._echoes[window], self._water[window]
+        for rows, around, inside in strips_of(len(echoes), SIGHT_CELLS):
             log_odds, observed = draw_faces(
-                self._echoes[around, cols],
-                self._water[around, cols],
+                echoes[around],
+                water[around],
                 _SMOOTHING,
                 _SMOOTHING_GAIN,
                 round(free),
@@ -279,8 +267,6 @@ class GrowingGrid:
                 _TAIL_REACH_CELLS,
                 _TAIL_SHARE,
             )
-            inside = slice(first - low, last - low)
-            rows = slice(first - window.start, last - window.start)
             yield rows, log_odds[inside], observed[inside]
 
     def _free_range_m(self, detections: Detections) -> FloatArray:

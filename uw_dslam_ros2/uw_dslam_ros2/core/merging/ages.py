@@ -34,7 +34,7 @@ def last_seen_ns(occupancy: OccupancyMap, records: Iterable[SubmapRecord]) -> ND
             continue
         grid = submap.grid
         cells = grid.spec.cells_of(record.T_component_submap.inverse().apply(points))
-        inside = np.flatnonzero(((cells >= 0) & (cells < grid.spec.shape)).all(axis=1))
+        inside = np.flatnonzero(grid.spec.contains(cells))
         has_it = inside[grid.known[tuple(cells[inside].T)]]
         latest[has_it] = np.maximum(latest[has_it], submap.trajectory_stamp_ns[-1])
     seen = np.zeros(occupancy.spec.shape, np.int64)

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.link.coding.cell_coder import (
     CELL_FREE,
     CELL_UNKNOWN,
@@ -132,10 +132,7 @@ def seen_free(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def known_window(cells: CellArray) -> tuple[slice, slice]:
     """Rows and columns around everything known; empty where nothing is."""
-    rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
-    if len(rows) == 0:
-        return slice(0, 0), slice(0, 0)
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+    return bounds_of(cells != CELL_UNKNOWN) or (slice(0, 0), slice(0, 0))
 
 
 def with_walls(known: CellArray, walls: NDArray[np.bool_]) -> CellArray:

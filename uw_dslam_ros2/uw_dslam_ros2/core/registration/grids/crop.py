@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["crop_to_known", "turn_to_own_axes"]
@@ -23,7 +23,7 @@ def crop_to_known(occupancy: OccupancyMap) -> OccupancyMap:
     Specks inside that part stay. The map itself where nothing would be cut.
     """
     known = occupancy.known
-    box = _bounds(known)
+    box = bounds_of(known)
     if box is None:
         return occupancy
     inner = np.ascontiguousarray(known[box])
@@ -42,10 +42,7 @@ def crop_to_known(occupancy: OccupancyMap) -> OccupancyMap:
     values = occupancy.values[box]
     if values.shape == occupancy.spec.shape:
         return occupancy
-    spec = occupancy.spec
-    corner = SE2(box[1].start * spec.resolution_m, box[0].start * spec.resolution_m)
-    num_rows, num_cols = values.shape
-    part = GridSpec(spec.resolution_m, num_rows, num_cols, spec.T_frame_grid @ corner)
+    part = occupancy.spec.part(box[0].start, box[1].start, *values.shape)
     return OccupancyMap(part, np.ascontiguousarray(values))
 
 
@@ -86,11 +83,3 @@ def _quarter_turned(occupancy: OccupancyMap) -> OccupancyMap:
     values = np.ascontiguousarray(occupancy.values.T[:, ::-1])
     turned = GridSpec(spec.resolution_m, spec.num_cols, spec.num_rows, corner)
     return OccupancyMap(turned, values)
-
-
-def _bounds(mask: NDArray[np.bool_]) -> tuple[slice, slice] | None:
-    """Rows and columns that hold all set cells; None without any."""
-    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if len(rows) == 0:
-        return None
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
