@@ -23,7 +23,7 @@ from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.merging import Decision, Georeference, MapQueue
 from uw_dslam_ros2.io.fixes import fixes_of_recordings
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
-from uw_dslam_ros2.io.session import SESSION_FOLDER, load_session, save_session
+from uw_dslam_ros2.io.session import SESSION_FOLDER, load_session, save_session, session_of
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import find_recordings
 
@@ -238,8 +238,7 @@ def _named_bags(options: Sequence[str]) -> dict[str, list[Path]]:
 
 
 def _decisions(folder: Path) -> tuple[Decision, ...]:
-    holder = folder / SESSION_FOLDER if (folder / SESSION_FOLDER).is_dir() else folder
-    return load_session(holder).to_state().decisions
+    return load_session(session_of(folder)).to_state().decisions
 
 
 def _truth(args: argparse.Namespace, first_bag: Path) -> Truth | None:

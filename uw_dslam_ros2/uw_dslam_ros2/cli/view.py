@@ -13,7 +13,7 @@ from pathlib import Path
 
 from uw_dslam_ros2.cli.common import parser_for, run_command
 from uw_dslam_ros2.cli.rewriting import has_report, write_anew
-from uw_dslam_ros2.io.session import SESSION_FOLDER, load_session
+from uw_dslam_ros2.io.session import load_session, session_of
 from uw_dslam_ros2.view.queue_source import QueueSource
 from uw_dslam_ros2.view.server import ViewServer
 
@@ -71,7 +71,7 @@ def _follow_graph(args: argparse.Namespace, ros_args: Sequence[str]) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     folder = args.folder
-    holder = folder / SESSION_FOLDER if (folder / SESSION_FOLDER).is_dir() else folder
+    holder = session_of(folder)
     write = functools.partial(write_anew, folder) if has_report(folder) else None
     source = QueueSource(folder.resolve().name, load_session(holder), holder, write)
     server = ViewServer(source, args.address, args.port, args.token)

@@ -80,14 +80,11 @@ def sensor_findings(vehicle: MappedVehicle) -> list[Finding]:
 
 def health_findings(vehicle: MappedVehicle) -> list[Finding]:
     """What should be told of a vehicle; an "error" means that there is no map of it."""
-    found: list[Finding] = []
+    found = sensor_findings(vehicle)
 
     def tell(kind: str, role: str, detail: str) -> None:
         found.append(Finding(kind, role, detail, vehicle_id=vehicle.vehicle_id))
 
-    _check_sensors(vehicle, tell)
-    _check_overlap(vehicle, tell)
-    _check_rate(vehicle, tell)
     _check_pings(vehicle, tell)
     _check_navigation(vehicle, tell)
     _check_gaps(vehicle, tell)

@@ -37,6 +37,7 @@ __all__ = [
     "has_session",
     "load_session",
     "save_session",
+    "session_of",
 ]
 
 SESSION_FILE = "session.sqlite"
@@ -166,6 +167,12 @@ def save_session(folder: str | Path, queue: MapQueue) -> Path:
     """Save once, see `Session.save`."""
     with Session(folder) as session:
         return session.save(queue)
+
+
+def session_of(folder: Path) -> Path:
+    """Where the session of a result's folder is; the folder itself where it is one."""
+    inner = folder / SESSION_FOLDER
+    return inner if inner.is_dir() else folder
 
 
 def has_session(folder: str | Path) -> bool:

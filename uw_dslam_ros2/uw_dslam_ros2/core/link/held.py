@@ -60,16 +60,15 @@ class HeldSubmaps:
                 raise InvalidInputError(f"outline of submap {outline.sequence} came as {key}")
         place = (sender, key.run, key.sequence)
         held = self.submaps.get(place) or LayeredSubmap(self._key)
-        below = -1 if held.cells is None else int(held.cells.layer)
-        if key.layer > Layer.COARSE and below < key.layer - 1:
+        if key.layer is Layer.FINE and held.cells is None:
             self._waiting[sender, key] = data
             return
         if held.add(data) is not key.layer:
             raise InvalidInputError(f"a layer came as {key.layer.name}, which it is not")
         self.submaps[place] = held
-        finer = LayerKey(key.run, key.sequence, Layer(min(key.layer + 1, Layer.FINE)))
-        if key.layer is not Layer.OUTLINE and (early := self._waiting.pop((sender, finer), None)):
-            self.take_layer(sender, finer, early)
+        fine = LayerKey(key.run, key.sequence, Layer.FINE)
+        if key.layer is Layer.COARSE and (early := self._waiting.pop((sender, fine), None)):
+            self.take_layer(sender, fine, early)
 
     def improved(self, sender: int) -> list[Submap]:
         """Submaps of a vehicle as they are now, if they were not given out like that before."""

@@ -170,15 +170,9 @@ def _accepted_beside(
         for answer in answers
         if answer.is_accepted and answer.query.key not in held and library.holds(answer.query)
     ]
-    found = []
-    for answer in sorted(beside, key=lambda answer: answer.query.key):
-        key = "beside", answer.query.key, answer.T_target_source, answer.probability
-        states = library.state_of(answer.query.source), library.state_of(answer.query.target)
-        work = functools.partial(constraint_of, library, answer)
-        constraint = library.remember((*key, states), work)
-        if _is_between_tracks(constraint):
-            found.append(constraint)
-    return found
+    beside.sort(key=lambda answer: answer.query.key)
+    found = (constraint_of(library, answer) for answer in beside)
+    return [constraint for constraint in found if _is_between_tracks(constraint)]
 
 
 def _is_between_tracks(constraint: Constraint) -> bool:
@@ -198,9 +192,7 @@ def _rival_place(
         rival = [c for _, c in same]
         log_odds = _log_odds(rival, track)
         if log_odds > best[0]:
-            here = component[end]
-            there = move @ here
-            best = log_odds, rival, math.hypot(there.x - here.x, there.y - here.y)
+            best = log_odds, rival, component[end].distance_to(move @ component[end])[0]
     return best[1], best[2]
 
 
@@ -214,11 +206,9 @@ def _move(component: Component, constraint: Constraint, track: Track) -> SE2:
 
 def _is_elsewhere(library: Library, component: Component, submap_id: SubmapId, move: SE2) -> bool:
     """Whether a move takes a submap to another place, beyond what maps bend."""
-    here = component[submap_id]
-    there = move @ here
-    way_m = math.hypot(there.x - here.x, there.y - here.y)
-    turn = abs(math.remainder(there.yaw - here.yaw, 2.0 * math.pi))
-    return way_m > _ELSEWHERE_SHARE * library.submaps[submap_id].radius_m or turn > _ELSEWHERE_RAD
+    way_m, turn_rad = component[submap_id].distance_to(move @ component[submap_id])
+    reach_m = _ELSEWHERE_SHARE * library.submaps[submap_id].radius_m
+    return way_m > reach_m or turn_rad > _ELSEWHERE_RAD
 
 
 def _own_end(constraint: Constraint, track: Track) -> SubmapId:

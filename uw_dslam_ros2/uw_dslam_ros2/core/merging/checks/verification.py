@@ -148,10 +148,7 @@ class Verifier:
 
     def constraint(self, answer: Answer) -> Constraint:
         """The edge of an answer; see `constraint_of`."""
-        library, query = self._library, answer.query
-        states = library.state_of(query.source), library.state_of(query.target)
-        key = "constraint", query.key, answer.T_target_source, answer.probability, states
-        return library.remember(key, lambda: constraint_of(library, answer))
+        return constraint_of(self._library, answer)
 
     def ask(self, query: Query) -> Answer | None:
         """The answer, if there is one; otherwise the question is noted as wanted."""

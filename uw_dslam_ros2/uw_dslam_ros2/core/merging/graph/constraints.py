@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +27,7 @@ residual shows.
 
 
 def constraint_of(library: Library, answer: Answer) -> Constraint:
-    """The edge of an answer, between the two submaps that share most.
+    """The edge of an answer, between the two submaps that share most; worked out once.
 
     Parameters
     ----------
@@ -34,6 +36,13 @@ def constraint_of(library: Library, answer: Answer) -> Constraint:
     answer
         With a transform that means something.
     """
+    query = answer.query
+    states = library.state_of(query.source), library.state_of(query.target)
+    key = "constraint", query.key, answer.T_target_source, answer.probability, states
+    return library.remember(key, functools.partial(_constraint_of, library, answer))
+
+
+def _constraint_of(library: Library, answer: Answer) -> Constraint:
     source, target = answer.query.source, answer.query.target
     T_target_source = answer.T_target_source
     assert T_target_source is not None
