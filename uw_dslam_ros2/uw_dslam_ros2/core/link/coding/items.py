@@ -6,8 +6,8 @@ import enum
 from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.link.coding.codec import Layer
 from uw_dslam_ros2.core.link.coding.fields import ByteReader, ByteWriter
+from uw_dslam_ros2.core.link.coding.layer import Layer
 
 __all__ = [
     "ItemKind",
