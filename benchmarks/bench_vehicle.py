@@ -18,7 +18,13 @@ from typing import Any
 import numpy as np
 from harness import emit, require, run_cases
 
-from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig, local_map, section
+from uw_dslam_ros2.core.mapping import (
+    VehicleMapper,
+    VehicleMapperConfig,
+    estimators,
+    local_map,
+    section,
+)
 from uw_dslam_ros2.core.mapping import vehicle_mapper as mapper_module
 from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.core.sonar import SonarImage
@@ -87,8 +93,8 @@ def ping(is_quick: bool) -> None:
     stages.wrap(local_map.LocalMap, "match", "scan matching")
     stages.wrap(section.GrowingGrid, "add", "occupancy grid")
     stages.wrap(section.OpenSection, "close", "closing submaps")
+    stages.wrap(estimators._Graph, "close_loops", "loops")
     mapper = VehicleMapper(VehicleMapperConfig(), "auv_1")
-    stages.wrap(mapper._estimator, "close_loops", "loops")
     per_ping: list[float] = []
     front_end: list[float] = []
     for message in messages[:3]:  # compile
@@ -223,7 +229,7 @@ def _closed_bytes(mapper: VehicleMapper) -> int:
     return sum(
         len(s.grid.data) + s.points.nbytes + s.weight.nbytes + s.trajectory.nbytes
         + s.stamps_ns.nbytes
-        for s in mapper._closed
+        for s in mapper._submaps.closed
     )  # fmt: skip
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,13 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.estimators import make_estimator
 from uw_dslam_ros2.core.mapping.key_pings import KeyPings
-from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
-from uw_dslam_ros2.core.mapping.vehicle_map import VehicleMap, path_of
-from uw_dslam_ros2.core.navigation import NavigationFilter
-from uw_dslam_ros2.core.navigation.pose_differences import PoseDifferences
-from uw_dslam_ros2.core.pose_graph import chained_covariance
+from uw_dslam_ros2.core.mapping.submap_chain import MapperWatch, SubmapChain
+from uw_dslam_ros2.core.mapping.vehicle_navigation import VehicleNavigation
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
     BeamGatherer,
@@ -32,16 +26,11 @@ from uw_dslam_ros2.core.sonar import (
     place_sweep,
 )
 from uw_dslam_ros2.core.sonar.turning import Sweep, beams_of_image, is_few_beams
-from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap, SubmapId
+from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap, Track
 
 __all__ = ["MapperWatch", "VehicleMapper"]
 
 FloatArray = NDArray[np.float64]
-MapperWatch = Callable[[SubmapId, Detections, SE2], None]
-_REISSUE_M, _REISSUE_RAD = 0.02, 0.002
-"""A submap that moved by more is given away again."""
-_ATTITUDE_NS = 500_000_000
-"""A vehicle rolls and pitches within seconds: older angles are not used."""
 _TURN_MEMORY_S = 120.0
 """A turn takes up to 35 s, and its message may come when the next one is complete."""
 _AHEAD_NS = 1_000_000_000
@@ -49,7 +38,7 @@ _AHEAD_NS = 1_000_000_000
 _FAN_BEAM_RAD = 0.01
 
 
-class VehicleMapper:
+class VehicleMapper(VehicleNavigation):
     """Maps one vehicle's surroundings; every input is a method call with a stamp in nanoseconds.
 
     Messages are to come in the order of their stamps, a ping after the navigation of its moment:
@@ -71,79 +60,17 @@ class VehicleMapper:
             raise InvalidInputError("vehicle_id is empty, expected a name")
         if not 0 < run_id <= MAX_RUN_ID:
             raise InvalidInputError(f"run_id is {run_id}, expected 1 to {MAX_RUN_ID}")
+        super().__init__(config.navigation)
         self._own_config = config
-        self._vehicle_id, self._run_id = vehicle_id, run_id
-        self._watch = watch
-        self._navigation = NavigationFilter(config.navigation)
+        self._track, self._watch = Track(vehicle_id, run_id), watch
         self._suit(_FAN_BEAM_RAD)
-        self._map = VehicleMap(config.occupancy)
-        self._closed: list[ClosedSection] = []
-        self._open: OpenSection | None = None
         self._last_ping_ns: int | None = None
-        self._counts: dict[str, float | int | str] = {
-            "num_pings": 0, "num_pings_dropped": 0, "num_pings_empty": 0,
-            "num_detections_last": 0, "depth_m": math.nan,
+        self._counts = {
+            "num_pings": 0, "num_pings_dropped": 0, "num_pings_empty": 0, "num_detections_last": 0,
         }  # fmt: skip
-        self._velocity_ns: int | None = None
-        self._pose_differences = PoseDifferences()
-        self._attitude: tuple[int, FloatArray | None] = (0, None)
         self._gatherer = BeamGatherer()
         # Until it is known what kind of sonar there is.
         self._navigation.remember(_TURN_MEMORY_S)
-
-    # --- navigation in
-    # -------------------------------------------------------------------------------------------
-
-    def add_imu(
-        self,
-        stamp_ns: int,
-        yaw_rad: float | None,
-        yaw_rate_rad_s: float | None,
-        yaw_sigma_rad: float | None = None,
-    ) -> None:
-        """Yaw and yaw rate of base_link, counter-clockwise; None where not measured.
-
-        Yaw may have an unknown constant offset.
-        """
-        if yaw_rate_rad_s is not None:
-            self._navigation.add_yaw_rate(stamp_ns, yaw_rate_rad_s)
-        if yaw_rad is not None:
-            self._navigation.add_yaw(stamp_ns, yaw_rad, yaw_sigma_rad)
-
-    def add_velocity(
-        self,
-        stamp_ns: int,
-        v_body_m_s: ArrayLike,
-        covariance: ArrayLike | None = None,
-        T_base_sensor: SE2 = SE2(),
-    ) -> None:
-        """Velocity (2,) along the instrument's axes (forward, left) with covariance (2, 2)."""
-        self._navigation.add_velocity(stamp_ns, v_body_m_s, covariance, T_base_sensor)
-        if np.isfinite(np.asarray(v_body_m_s, dtype=np.float64)).all():
-            self._velocity_ns = max(stamp_ns, self._velocity_ns or stamp_ns)
-
-    def add_pose(self, stamp_ns: int, T_frame_base: SE2) -> None:
-        """Pose that the vehicle's own filter gives; only the motion between poses is used."""
-        self._navigation.add_yaw(stamp_ns, T_frame_base.yaw)
-        if (difference := self._pose_differences.add(stamp_ns, T_frame_base)) is not None:
-            self.add_velocity(*difference)
-
-    def add_attitude(self, stamp_ns: int, R_level_base: FloatArray | None) -> None:
-        """Roll and pitch (3, 3), from base_link to the level frame of the same yaw."""
-        self._attitude = (stamp_ns, R_level_base)
-
-    def attitude_at(self, stamp_ns: int) -> FloatArray | None:
-        """Roll and pitch (3, 3) as last measured; None where that is not known or long ago."""
-        measured_ns, R_level_base = self._attitude
-        return R_level_base if abs(stamp_ns - measured_ns) <= _ATTITUDE_NS else None
-
-    def add_depth(self, stamp_ns: int, depth_m: float) -> None:  # noqa: ARG002 (one form for all inputs)
-        """Depth below the surface [m], positive down.
-
-        Kept for the diagnostics: the map is flat.
-        """
-        if math.isfinite(depth_m):
-            self._counts["depth_m"] = float(depth_m)
 
     # --- sonar in
     # ----------------
@@ -201,40 +128,27 @@ class VehicleMapper:
     def finish(self) -> list[Submap]:
         """Close the open submap, and settle the graph; no ping may follow."""
         issued = self._add_sweeps(self._gatherer.take(None))
-        if self._open is None:
+        if self._submaps.growing is None:
             return issued
-        last_ns = int(self._open.stamps_ns[-1])
-        return issued + self._close(self._navigation.relative_at(last_ns)[1])
+        last_ns = int(self._submaps.growing.stamps_ns[-1])
+        return issued + self._submaps.close(self._navigation.relative_at(last_ns)[1])
 
     def issued(self, sequence: int) -> Submap | None:
         """A submap as it was given away last; None if there is none of this number."""
-        for section in self._closed:
-            if section.sequence == sequence:
-                return self._submap_of(section, section.T_odom_issued)
-        return None
+        return self._submaps.issued(sequence)
 
     # --- results
     # ----------------
 
     @property
-    def is_started(self) -> bool:
-        """Whether there is a pose."""
-        return self._navigation.is_started
-
-    @property
     def run_id(self) -> int:
         """Which run of its vehicle this is, see `core.submap.Track`."""
-        return self._run_id
+        return self._track.run_id
 
     @property
     def num_pings(self) -> int:
         """Pings mapped so far."""
-        return int(self._counts["num_pings"])
-
-    @property
-    def stamp_ns(self) -> int | None:
-        """Time of `T_odom_base`: of the newest navigation message; None before the first."""
-        return self._navigation.stamp_ns
+        return self._counts["num_pings"]
 
     @property
     def T_odom_base(self) -> SE2:  # noqa: N802 (a motion)
@@ -242,108 +156,45 @@ class VehicleMapper:
 
         Raises `InvalidInputError` before the first navigation message.
         """
-        stamp_ns = self._navigation.stamp_ns
-        if stamp_ns is None:
-            raise InvalidInputError("there is no pose yet, expected navigation messages first")
-        if self._open is None:
-            if self._closed:
-                last = self._closed[-1]
-                return self._estimator.poses[-1] @ SE2.from_array(last.trajectory[-1])
-            return self._navigation.pose_at(stamp_ns)[0]
-        return self._estimator.poses[-1] @ self._navigation.relative_at(stamp_ns)[0]
-
-    @property
-    def T_smooth_base(self) -> SE2:  # noqa: N802 (a motion)
-        """Where the vehicle is now, in a frame that loop closures do not move: it drifts.
-
-        Raises `InvalidInputError` before the first navigation message.
-        """
-        stamp_ns = self._navigation.stamp_ns
-        if stamp_ns is None:
-            raise InvalidInputError("there is no pose yet, expected navigation messages first")
-        return self._navigation.pose_at(stamp_ns)[0]
-
-    @property
-    def smooth_covariance(self) -> FloatArray:
-        """Covariance (3, 3) of `T_smooth_base`, order x, y, yaw."""
-        stamp_ns = self._navigation.stamp_ns
-        if stamp_ns is None:
-            raise InvalidInputError("there is no pose yet, expected navigation messages first")
-        return self._navigation.pose_at(stamp_ns)[1]
-
-    @property
-    def velocity_covariance(self) -> FloatArray:
-        """Covariance (3, 3) of `velocity`: forward, left [m/s], yaw rate [rad/s]."""
-        stamp_ns = self._navigation.stamp_ns
-        if stamp_ns is None:
-            raise InvalidInputError("there is no velocity yet, expected navigation messages first")
-        return self._navigation.velocity_covariance_at(stamp_ns)
-
-    @property
-    def depth_m(self) -> float:
-        """Depth below the surface as last measured; NaN where it is not."""
-        return float(self._counts["depth_m"])
+        if self._submaps.is_empty:
+            return self.T_smooth_base
+        return self._submaps.T_odom_base(self._in_submap()[0])
 
     @property
     def pose_covariance(self) -> FloatArray:
         """Covariance (3, 3) of `T_odom_base`, order x, y, yaw, in odom."""
-        stamp_ns = self._navigation.stamp_ns
-        if stamp_ns is None:
-            raise InvalidInputError("there is no pose yet, expected navigation messages first")
-        if self._estimator.num_loops_believed == 0:
-            return self._navigation.pose_at(stamp_ns)[1]
-        T_odom_submap = self._estimator.poses[-1]
-        T_submap_base, own = SE2(), np.zeros((3, 3))
-        if self._open is not None:
-            T_submap_base, own = self._navigation.relative_at(stamp_ns)
-        return chained_covariance(T_odom_submap, self._estimator.covariance(), T_submap_base, own)
-
-    @property
-    def velocity(self) -> tuple[FloatArray, float]:
-        """Body velocity (2,) [m/s] over ground and yaw rate [rad/s] now."""
-        stamp_ns = self._navigation.stamp_ns
-        if stamp_ns is None:
-            raise InvalidInputError("there is no velocity yet, expected navigation messages first")
-        return self._navigation.velocity_at(stamp_ns)
+        if self._submaps.estimator.num_loops_believed == 0:
+            return self.smooth_covariance
+        return self._submaps.covariance(*self._in_submap())
 
     def trajectory(self) -> tuple[NDArray[np.int64], FloatArray]:
         """Stamps (K,) and poses (K, 3) of base_link in odom at every ping, as best known now."""
-        return path_of(self._closed, self._open, self._estimator.poses)
+        return self._submaps.trajectory()
 
     def vehicle_map(self) -> OccupancyMap:
         """All submaps, the open one included, in odom: as they were last issued.
 
         Raises `InvalidInputError` before the first ping.
         """
-        if not self._closed and self._open is None:
+        if self._submaps.is_empty:
             raise InvalidInputError("there is no map yet, expected a ping with navigation first")
-        T_odom_newest = self._estimator.poses[-1]
-        return self._map.draw(self._closed, self._open, T_odom_newest)
+        return self._submaps.occupancy()
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counters and the filter's beliefs, by name."""
-        navigation = self._navigation
-        newest_ns = navigation.stamp_ns
-        age_s = math.nan
-        if newest_ns is not None and self._velocity_ns is not None:
-            age_s = (newest_ns - self._velocity_ns) * 1e-9
+        estimator = self._submaps.estimator
         return {
-            "vehicle_id": self._vehicle_id,
+            "vehicle_id": self._track.vehicle_id,
             "estimator": self._config.estimator,
             **self._counts,
             "num_key_pings": self._keys.num_pings,
             "num_matches": self._keys.num_matches,
             "match_overlap_last": self._keys.overlap_last,
-            "num_submaps": len(self._closed),
-            "num_submaps_not_drawn": self._map.num_left_out,
-            "num_loops": self._estimator.num_loops,
-            "num_loops_believed": self._estimator.num_loops_believed,
-            "velocity_age_s": age_s,
-            "num_navigation_late": navigation.num_late,
-            "num_navigation_invalid": navigation.num_invalid,
-            "num_navigation_outliers": navigation.num_outliers,
-            **navigation.counts(),
-            **navigation.sensor_errors(),
+            "num_submaps": len(self._submaps.closed),
+            "num_submaps_not_drawn": self._submaps.num_not_drawn,
+            "num_loops": estimator.num_loops,
+            "num_loops_believed": estimator.num_loops_believed,
+            **self.navigation_diagnostics(),
         }
 
     # --- inside
@@ -374,8 +225,12 @@ class VehicleMapper:
     def _suit(self, beamwidth_rad: float) -> None:
         """Take settings that are left to the sonar from the first that is known of it."""
         self._config = self._own_config.suited(beamwidth_rad)
-        self._estimator = make_estimator(self._config)
+        self._submaps = SubmapChain(self._config, self._track, self._watch)
         self._keys = KeyPings(self._config, self._navigation)
+
+    def _in_submap(self) -> tuple[SE2, FloatArray]:
+        """Where the vehicle is in the submap that is open, and its covariance (3, 3)."""
+        return self._navigation.relative_at(self._now_ns())
 
     def _add_sweeps(self, sweeps: list[Sweep]) -> list[Submap]:
         issued: list[Submap] = []
@@ -399,7 +254,7 @@ class VehicleMapper:
         return issued
 
     def _count(self, name: str) -> None:
-        self._counts[name] = int(self._counts[name]) + 1
+        self._counts[name] += 1
 
     def _process(
         self, detections: Detections, T_base_sonar: SE2, sweep: PlacedSweep | None
@@ -410,69 +265,24 @@ class VehicleMapper:
         self._counts["num_detections_last"] = len(detections.points)
         if not len(detections.points):
             self._count("num_pings_empty")
-        if self._open is None:
-            self._begin(stamp_ns)
-        assert self._open is not None
+        submaps, navigation = self._submaps, self._navigation
+        if submaps.growing is None:
+            submaps.begin(*navigation.pose_at(stamp_ns))
+            navigation.clone(stamp_ns)
         if self._keys.is_due(stamp_ns):
             self._keys.match(detections, T_base_sonar)
-        T_submap_base, covariance = self._navigation.relative_at(stamp_ns)
+        T_submap_base, covariance = navigation.relative_at(stamp_ns)
         # At the submap's own start the covariance is zero, which may come out as a trace below it.
         sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
-        if self._open.should_close(stamp_ns, sigma_m, self._velocity_ns is None):
-            issued = self._close(covariance)
-            self._begin(stamp_ns, T_submap_base, covariance)
+        assert submaps.growing is not None
+        if submaps.growing.should_close(stamp_ns, sigma_m, self._velocity_ns is None):
+            issued = submaps.close(covariance)
+            submaps.go_on(T_submap_base, covariance)
+            self._keys.rebase(T_submap_base.inverse())
+            navigation.clone(stamp_ns)
             T_submap_base = SE2()
         if sweep is None:
-            self._open.add(detections, T_submap_base, T_base_sonar)
+            submaps.growing.add(detections, T_submap_base, T_base_sonar)
         else:
-            self._open.add_sweep(sweep, T_submap_base)
+            submaps.growing.add_sweep(sweep, T_submap_base)
         return issued
-
-    def _begin(
-        self,
-        stamp_ns: int,
-        T_previous_new: SE2 | None = None,
-        covariance: FloatArray | None = None,
-    ) -> None:
-        """Open a submap at the vehicle's pose of now."""
-        T_odom_base, odom_covariance = self._navigation.pose_at(stamp_ns)
-        index = len(self._closed)
-        if T_previous_new is None or covariance is None:
-            covariance = odom_covariance
-            self._estimator.add_first(T_odom_base, odom_covariance)
-        else:
-            self._estimator.add_next(T_previous_new, covariance)
-            self._keys.rebase(T_previous_new.inverse())
-        watch = None
-        if self._watch is not None:
-            submap_id = SubmapId(self._vehicle_id, self._run_id, index)
-            watch = functools.partial(self._watch, submap_id)
-        self._open = OpenSection(self._config, index, covariance, watch)
-        self._navigation.clone(stamp_ns)
-
-    def _close(self, drift: FloatArray) -> list[Submap]:
-        """Close the open submap, look for loops, and say which submaps are new or have moved."""
-        assert self._open is not None
-        poses = self._estimator.poses
-        section = self._open.close(poses[-1], drift)
-        self._closed.append(section)
-        self._open = None
-        self._estimator.close_loops(self._closed)
-        return self._issue(new=section)
-
-    def _issue(self, new: ClosedSection | None = None) -> list[Submap]:
-        issued = []
-        for section, T_odom_submap in zip(self._closed, self._estimator.poses, strict=False):
-            distance, turn = section.T_odom_issued.distance_to(T_odom_submap)
-            has_moved = distance > _REISSUE_M or turn > _REISSUE_RAD
-            if section is not new:
-                if not has_moved:
-                    continue
-                section.revision += 1
-            section.T_odom_issued = T_odom_submap
-            issued.append(self._submap_of(section, T_odom_submap))
-        return issued
-
-    def _submap_of(self, section: ClosedSection, T_odom_submap: SE2) -> Submap:
-        log_odds_max = self._config.occupancy.log_odds_max
-        return section.to_submap(self._vehicle_id, self._run_id, T_odom_submap, log_odds_max)
