@@ -31,15 +31,18 @@ _REACH_CELLS = 2
 """Walls so near are the same wall to the eye: their own thickness."""
 _MARGIN_CELLS = 4
 _CLEAR = 90  # opacity, of 255
-# Okabe and Ito's colours, which colour-blind people tell apart: red, green, blue, opacity.
+# Okabe and Ito's colours, which colour-blind people tell apart: red, green, blue, opacity. What
+# tells more comes later: it outlasts the others where cells become fewer.
 _COLOURS = {
+    "unknown": (0, 0, 0, 0),
     "free": (226, 232, 237, 255),
     "target": (86, 180, 233, 255),
     "source": (230, 159, 0, 255),
     "agree": (0, 78, 56, 255),
     "conflict": (204, 40, 0, 255),
 }
-
+_INDEX = {name: index for index, name in enumerate(_COLOURS)}
+_TABLE = np.array(list(_COLOURS.values()), np.uint8)
 
 KEY = {
     "walls of both": _COLOURS["agree"],
@@ -65,27 +68,28 @@ class Pair:
         """
         if layer != "agreement":
             return map_picture(self.target if layer == "target" else self.source, layer)
-        return _few_colours_png(self.agreement(max_side))
+        return _png(self._told(max_side), _TABLE)
 
-    def agreement(self, max_side: int | None = None) -> ByteArray:
+    def agreement(self) -> ByteArray:
         """(R, C, 4) red, green, blue, opacity: what agrees and what conflicts, see `KEY`."""
-        walls = self.target >= _WALL_PERCENT, self.source >= _WALL_PERCENT
+        return _TABLE[self._told(None)]
+
+    def _told(self, max_side: int | None) -> ByteArray:
+        """Of each cell the index of its colour."""
         maps = self.target, self.source
-        # What tells more has a larger number.
-        names = ("", "free", "target", "source", "agree", "conflict")
-        shown = ((self.target >= 0) | (self.source >= 0)).astype(np.uint8)
+        walls = self.target >= _WALL_PERCENT, self.source >= _WALL_PERCENT
+        told = ((self.target >= 0) | (self.source >= 0)).astype(np.uint8) * _INDEX["free"]
         side = 2 * _REACH_CELLS + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         near = [cv2.dilate(wall.astype(np.uint8), kernel).astype(bool) for wall in walls]
         for own, other, name in ((0, 1, "target"), (1, 0, "source")):
-            shown[walls[own]] = names.index(name)
+            told[walls[own]] = _INDEX[name]
             is_free = (maps[other] >= 0) & (maps[other] <= _FREE_PERCENT)
-            shown[walls[own] & is_free & ~near[other]] = names.index("conflict")
-        shown[(walls[0] & near[1]) | (walls[1] & near[0])] = names.index("agree")
+            told[walls[own] & is_free & ~near[other]] = _INDEX["conflict"]
+        told[(walls[0] & near[1]) | (walls[1] & near[0])] = _INDEX["agree"]
         if max_side is not None:
-            shown = _reduced(shown, math.ceil(max(shown.shape) / max_side))
-        table = np.array([(0, 0, 0, 0), *(_COLOURS[name] for name in names[1:])], np.uint8)
-        return table[shown]
+            told = _reduced(told, math.ceil(max(told.shape) / max_side))
+        return told.astype(np.uint8)
 
 
 def _reduced(values: ByteArray, step: int) -> ByteArray:
@@ -110,23 +114,21 @@ def map_picture(values: NDArray[np.int8], layer: str, *, is_clear: bool = False)
     """
     if layer not in ("source", "target"):
         raise InvalidInputError(f"layer is {layer!r}, expected source or target")
-    rgba = np.zeros((*values.shape, 4), np.uint8)
-    rgba[values >= 0] = _COLOURS["free"]
+    told = (values >= 0).astype(np.uint8) * np.uint8(_INDEX["free"])
+    told[values >= _WALL_PERCENT] = _INDEX[layer]
+    table = _TABLE.copy()
     if is_clear:
-        rgba[values >= 0, 3] = _CLEAR
-    rgba[values >= _WALL_PERCENT] = _COLOURS[layer]
-    return _few_colours_png(rgba)
+        table[_INDEX["free"], 3] = _CLEAR
+    return _png(told, table)
 
 
-def _few_colours_png(rgba: ByteArray) -> bytes:
-    """PNG with a palette, north up: a quarter of the size."""
-    packed = np.ascontiguousarray(rgba[::-1]).view(np.uint32)[:, :, 0]
-    colours, index = np.unique(packed, return_inverse=True)
-    table = colours.view(np.uint8).reshape(-1, 4)
-    picture = Image.fromarray(index.reshape(packed.shape).astype(np.uint8)).convert("P")
+def _png(told: ByteArray, table: ByteArray) -> bytes:
+    """PNG with a palette (K, 4), north up: a quarter of the size."""
+    picture = Image.fromarray(np.ascontiguousarray(told[::-1])).convert("P")
     picture.putpalette(table[:, :3].tobytes())
     buffer = io.BytesIO()
-    picture.save(buffer, "PNG", transparency=table[:, 3].tobytes(), optimize=True)
+    # A page waits for it: the last tenth of the bytes costs most of the time.
+    picture.save(buffer, "PNG", transparency=table[:, 3].tobytes(), compress_level=4)
     return buffer.getvalue()
 
 
@@ -154,7 +156,7 @@ def rendered(group: SubmapGroup, submaps: Mapping[SubmapId, StoredSubmap]) -> Oc
 
 
 def lay_on(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> Pair:
-    """Lay the source on the target's lattice, which grows to hold both."""
+    """Lay the source on the target's lattice, as far as either knows something."""
     spec = target.spec
     # Corners of the source in cells of the target.
     T_grid_source = spec.T_frame_grid.inverse() @ T_target_source
@@ -168,7 +170,20 @@ def lay_on(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> 
     own[
         -window.row_0 : spec.num_rows - window.row_0, -window.col_0 : spec.num_cols - window.col_0
     ] = target.values
-    return Pair(laid, own, _resampled(source, T_target_source.inverse(), laid))
+    other = _resampled(source, T_target_source.inverse(), laid)
+    known = (own != UNKNOWN) | (other != UNKNOWN)
+    if not known.any():
+        return Pair(laid, own, other)
+    (row_0, row_1), (col_0, col_1) = (_span(known.any(axis=axis)) for axis in (1, 0))
+    shown = slice(row_0, row_1), slice(col_0, col_1)
+    spec = laid.part(row_0, col_0, row_1 - row_0, col_1 - col_0)
+    return Pair(spec, own[shown], other[shown])
+
+
+def _span(known: NDArray[np.bool_]) -> tuple[int, int]:
+    """First, and one past the last, with a margin where there is room for one."""
+    found = np.flatnonzero(known)
+    return max(0, int(found[0]) - _MARGIN_CELLS), min(len(known), int(found[-1]) + _MARGIN_CELLS + 1)
 
 
 def _resampled(source: OccupancyMap, T_source_target: SE2, laid: GridSpec) -> NDArray[np.int8]:
