@@ -20,6 +20,8 @@ from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.ros.convert.core_types import transform2d_to_msg
 from uw_dslam_ros2.ros.convert.decisions import decision_from_msg, decision_to_msg
 from uw_dslam_ros2.ros.convert.graph_markers import graph_to_markers
+from uw_dslam_ros2.ros.nodes import registration_server
+from uw_dslam_ros2.sim.fleets import make_result
 
 pytestmark = pytest.mark.ros
 
@@ -35,6 +37,19 @@ def edges(probe, kind):
     return [edge for edge in probe.statuses[-1].constraints if edge.kind == kind]
 
 
+@pytest.fixture
+def knowing(monkeypatch):
+    """A server that knows where the two lie: it is not the search that is tested here."""
+
+    def find(source, target, *_args, **_options):
+        is_second = [abs(side.spec.T_frame_grid.yaw) > 1.0 for side in (source, target)]
+        assert is_second in ([False, True], [True, False])
+        return make_result(TRUE if is_second[0] else TRUE.inverse())
+
+    monkeypatch.setattr(registration_server, "register_grids", find)
+
+
+@pytest.mark.usefixtures("knowing")
 def test_people_forbid_confirm_and_undo(manage, tmp_path):  # noqa: F811
     with manage(**FAST) as (until, probe, call):
 
@@ -74,6 +89,7 @@ def test_people_forbid_confirm_and_undo(manage, tmp_path):  # noqa: F811
         assert len(call(ListDecisions, "list_decisions").decisions) == 3
 
 
+@pytest.mark.usefixtures("knowing")
 def test_a_map_is_pinned_fixed_and_registered_by_hand(manage):  # noqa: F811
     with manage(**FAST) as (until, probe, call):
 

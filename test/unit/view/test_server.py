@@ -16,8 +16,9 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.io.maps import read_map
 from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
+from uw_dslam_ros2.view.guard import is_loopback
 from uw_dslam_ros2.view.queue_source import QueueSource
-from uw_dslam_ros2.view.server import ViewServer, is_loopback
+from uw_dslam_ros2.view.server import ViewServer
 
 VEHICLES = ("auv_1", "auv_2", "auv_3")
 

@@ -183,7 +183,9 @@ def lay_on(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> 
 def _span(known: NDArray[np.bool_]) -> tuple[int, int]:
     """First, and one past the last, with a margin where there is room for one."""
     found = np.flatnonzero(known)
-    return max(0, int(found[0]) - _MARGIN_CELLS), min(len(known), int(found[-1]) + _MARGIN_CELLS + 1)
+    return max(0, int(found[0]) - _MARGIN_CELLS), min(
+        len(known), int(found[-1]) + _MARGIN_CELLS + 1
+    )
 
 
 def _resampled(source: OccupancyMap, T_source_target: SE2, laid: GridSpec) -> NDArray[np.int8]:

@@ -6,38 +6,26 @@ import asyncio
 import contextlib
 import functools
 import gzip
-import hmac
-import ipaddress
 import json
-import secrets
 import time
 from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
-from typing import Any, Protocol
+from typing import Any
 
 from aiohttp import web
 
 from uw_dslam_ros2.core.errors import InvalidInputError, UwDslamError
-from uw_dslam_ros2.core.merging import Decision
 from uw_dslam_ros2.io.decisions import decision_from_plain
 from uw_dslam_ros2.view.export import export_zip
+from uw_dslam_ros2.view.guard import HEADERS, Guard
 from uw_dslam_ros2.view.laying import lay_out, run_map
 from uw_dslam_ros2.view.pace import Pace
 from uw_dslam_ros2.view.pairs import PAIR_LAYERS, Pair
-from uw_dslam_ros2.view.showing import Showing
+from uw_dslam_ros2.view.source import Source
 
-__all__ = ["Source", "ViewServer", "is_loopback"]
+__all__ = ["ViewServer"]
 
-_COOKIE = "uw_view_token"
-_HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
-        "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-}
 _MAX_ZOOM, _MIN_ZOOM = 10, -8
 _MAX_PAIRS = 8
 _MAX_BODY_BYTES = 10_000
@@ -45,47 +33,6 @@ _SHARE = 0.2
 """Of a core, that pages which follow changes may cost: they are told of them less often."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-
-
-class Source(Protocol):
-    """Where what is shown comes from: a session on disk, or a running graph."""
-
-    @property
-    def title(self) -> str:
-        """What it is, for the page's head."""
-
-    def showing(self) -> Showing:
-        """The newest state."""
-
-    def status(self) -> dict[str, Any]:
-        """What changes without the map changing: ages, diagnostics, bytes on the link."""
-
-    def decide(self, decision: Decision) -> Decision:
-        """Write down what a person decided; its number and time are given here.
-
-        Raises an error that says why it cannot be.
-        """
-
-    def listen(self, on_change: Callable[[], None]) -> None:
-        """Have something called, in any thread, whenever what is shown has changed."""
-
-
-def is_loopback(address: str) -> bool:
-    """Whether only this machine reaches an address.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is no address.
-    """
-    if address == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(address).is_loopback
-    except ValueError as error:
-        raise InvalidInputError(
-            f"address is {address!r}, expected an IP address such as 127.0.0.1, or localhost"
-        ) from error
 
 
 class ViewServer:
@@ -96,15 +43,14 @@ class ViewServer:
     address, port
         Where to listen; port 0 takes a free one.
     token
-        What a browser must know; drawn at random where another machine may reach the address
-        and none is given. None on the loopback address: nobody is asked.
+        See `Guard`.
     """
 
     def __init__(
         self, source: Source, address: str = "127.0.0.1", port: int = 0, token: str = ""
     ) -> None:
         self._source, self._address, self._port = source, address, port
-        self._token = token or ("" if is_loopback(address) else secrets.token_urlsafe(16))
+        self._guard = Guard(address, token)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="view")
         self._changed = asyncio.Condition()
         self._runner: web.AppRunner | None = None
@@ -115,7 +61,7 @@ class ViewServer:
 
     async def start(self) -> str:
         """Listen; returns the page's address for a browser."""
-        app = web.Application(middlewares=[self._guard], client_max_size=_MAX_BODY_BYTES)
+        app = web.Application(middlewares=[self._answer], client_max_size=_MAX_BODY_BYTES)
         app.add_routes(
             [
                 web.get("/", self._page),
@@ -147,7 +93,7 @@ class ViewServer:
             ) from error
         port = self._runner.addresses[0][1]
         host = f"[{self._address}]" if ":" in self._address else self._address
-        query = f"/?token={self._token}" if self._token else "/"
+        query = f"/?token={self._guard.token}" if self._guard.token else "/"
         return f"http://{host}:{port}{query}"
 
     async def notify(self) -> None:
@@ -177,9 +123,9 @@ class ViewServer:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     @web.middleware
-    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse other sites' pages and strangers; tell mistakes in a sentence."""
-        refused = self._refusal(request)
+        refused = self._guard.refusal(request)
         if refused is not None:
             return refused
         try:
@@ -187,39 +133,13 @@ class ViewServer:
         except (UwDslamError, ValueError, TimeoutError) as error:
             response = web.json_response({"error": str(error)}, status=400)
         if not response.prepared:
-            response.headers.update(_HEADERS)
+            response.headers.update(HEADERS)
             response.headers.setdefault("Cache-Control", "no-store")
         return response
 
-    def _refusal(self, request: web.Request) -> web.Response | None:
-        host = request.host.rsplit(":", 1)[0].strip("[]")
-        if not self._token and not _is_own_name(host):
-            # Another name that resolves to this machine is another site's doing.
-            return web.Response(status=403, text=f"this view is not served as {host}")
-        origin = request.headers.get("Origin")
-        if origin is not None and origin != f"{request.scheme}://{request.host}":
-            return web.Response(status=403, text="pages of other sites may not ask this view")
-        if request.method not in ("GET", "HEAD") and (
-            origin is None or request.content_type != "application/json"
-        ):
-            # Browsers say where what changes something comes from; a form cannot send this type.
-            return web.Response(
-                status=403,
-                text="only the view's own page may change it: JSON, with an Origin",
-            )
-        if not self._token:
-            return None
-        given = request.query.get("token") or request.cookies.get(_COOKIE, "")
-        if hmac.compare_digest(given.encode(), self._token.encode()):
-            return None
-        return web.Response(
-            status=401, text="a token is needed: open the address that the view printed"
-        )
-
     async def _page(self, _request: web.Request) -> web.StreamResponse:
         response = web.Response(body=_static_bytes("index.html"), content_type="text/html")
-        if self._token:
-            response.set_cookie(_COOKIE, self._token, httponly=True, samesite="Strict")
+        self._guard.remember(response)
         return response
 
     async def _static(self, request: web.Request) -> web.StreamResponse:
@@ -253,7 +173,7 @@ class ViewServer:
 
     async def _events(self, request: web.Request) -> web.StreamResponse:
         """A line for each change, so that pages need not ask."""
-        response = web.StreamResponse(headers={**_HEADERS, "Cache-Control": "no-store"})
+        response = web.StreamResponse(headers={**HEADERS, "Cache-Control": "no-store"})
         response.content_type = "text/event-stream"
         await response.prepare(request)
         try:
@@ -383,13 +303,6 @@ def _call_in(
     """Have something done in a loop, which may have ended."""
     with contextlib.suppress(RuntimeError):
         loop.call_soon_threadsafe(lambda: loop.create_task(work()))
-
-
-def _is_own_name(host: str) -> bool:
-    try:
-        return is_loopback(host)
-    except InvalidInputError:
-        return False
 
 
 def _pair_of(request: web.Request) -> tuple[int, int | None]:
