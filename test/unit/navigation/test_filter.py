@@ -218,6 +218,37 @@ def test_a_sensor_that_insists_is_believed_again():
     assert velocity[0] == pytest.approx(3.0, abs=0.1)
 
 
+@pytest.mark.parametrize("lost_s", [(0, 0), (10, 16), (10, 40)])
+def test_a_wild_velocity_is_not_believed_because_nothing_is_known(lost_s):
+    """The first velocity, and the first after a silence, may be the one that is wrong."""
+    clean, dirty = NavigationFilter(), NavigationFilter()
+    end_s = 60
+    for i in range(end_s * 5 + 1):
+        t = i * S // 5
+        for navigation in (clean, dirty):
+            navigation.add_yaw(t, 0.02 * i)
+        if lost_s[0] <= t / S < lost_s[1]:
+            continue
+        is_first = t == lost_s[1] * S
+        clean.add_velocity(t, (0.8, 0.1))
+        dirty.add_velocity(t, (3.0, -3.0) if is_first else (0.8, 0.1))
+    (a, _), (b, _) = clean.pose_at(end_s * S), dirty.pose_at(end_s * S)
+    assert a.distance_to(b)[0] < 0.1  # 1 s at that velocity is 4 m
+
+
+def test_a_filter_that_was_wrong_makes_up_for_the_way_it_missed():
+    """And says that it does not know how much of the time it was."""
+    navigation = NavigationFilter()
+    for i in range(400):
+        navigation.add_yaw(i * S // 10, 0.0)
+        navigation.add_velocity(i * S // 10, (0.0 if i < 100 else 5.0, 0.0))
+    pose, covariance = navigation.pose_at(399 * S // 10)
+    assert navigation.velocity_at(399 * S // 10)[0][0] == pytest.approx(5.0, abs=0.1)
+    wrong_m = abs(5.0 * 29.9 - pose.x)
+    assert wrong_m < 5.0  # of 100 m in the 20 s before it believed that
+    assert wrong_m < 3.0 * math.sqrt(covariance[0, 0])
+
+
 def test_without_any_yaw_the_first_direction_is_zero():
     navigation = NavigationFilter()
     for i in range(50):
