@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from unit.mapping.test_vehicle_mapper import CONFIG, SONAR, S, mission
 
 from uw_dslam_ros2.core.mapping import RunBreak, VehicleRuns
 from uw_dslam_ros2.core.metrics import align_points
+from uw_dslam_ros2.core.navigation import NavigationConfig
 
 EVENTS, TRUTH = mission(60)
 
@@ -94,8 +96,27 @@ def test_a_vehicle_that_rests_may_stop_saying_so():
     for t in range(0, 60, 1):
         runs.note_heading(t * S)
         if not 10 < t < 50:
-            assert runs.note_velocity(t * S, 0.5 if t < 9 else 0.0) == []
+            assert runs.note_velocity(t * S, 0.0 if 9 <= t < 50 else 0.5) == []
     assert runs.breaks == []
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "walk_m_s", "is_new"),
+    [(1.0, 0.15, True), (0.15, 0.15, False), (1.0, 0.005, False), (1.0, 0.05, True)],
+)
+def test_the_way_counts_that_it_may_have_gone_unseen_not_the_time(speed_m_s, walk_m_s, is_new):
+    """A slow vehicle, or one known to keep its speed, is not far from where it was going."""
+    config = replace(CONFIG, navigation=NavigationConfig(velocity_walk_m_s=walk_m_s))
+    ids = itertools.count(1)
+    runs = VehicleRuns(config, "auv_1", lambda: next(ids))
+    for t in range(60):
+        runs.note_heading(t * S)
+        runs.mapper.add_imu(t * S, 0.0, None)
+        if not 20 < t < 40:
+            runs.note_velocity(t * S, speed_m_s)
+            runs.mapper.add_velocity(t * S, (speed_m_s, 0.0))
+        runs.mapper.add_scan(t * S, [-0.1, 0.0, 0.1], [9.0, 9.0, 9.0], 60.0, SONAR)
+    assert len(runs.breaks) == is_new
 
 
 def test_a_silence_before_anything_is_mapped_is_no_run():

@@ -153,8 +153,8 @@ class VehicleMapperConfig(Config):
         10.0,
         1.0,
         1e6,
-        "longest silence of the heading, or of the velocity while the vehicle moves, that is "
-        "bridged [s]; after a longer one a new run begins",
+        "longest silence of the heading, or of the velocity of a vehicle that may go over 4 m in "
+        "it unseen, that is bridged [s]; after a longer one a new run begins",
     )
     sonar: SonarConfig = setting(SonarConfig())
     navigation: NavigationConfig = setting(NavigationConfig())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,6 +21,8 @@ _DOUBT_S = 3.0
 _DOUBT_PERIODS = 5.0
 _AT_REST_M_S = 0.1
 """Slower than that, a vehicle that says no more how fast it is is taken to stay where it is."""
+_FAR_M = 4.0
+"""Two windows of the scan matcher: what went no farther unseen finds back by its echoes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +56,9 @@ class _Stream:
 class VehicleRuns:
     """Gives each run a `VehicleMapper` of its own.
 
-    A heading that is missing for long, or the velocity of a vehicle that moves, leaves it at a
-    place that nobody knows: what comes after is a new run, which registration may join to what was
-    before. Pings without a heading are left out meanwhile.
+    A heading that is missing for long, or the velocity of a vehicle that may have come far
+    meanwhile, leaves it at a place that nobody knows: what comes after is a new run, which
+    registration may join to what was before. Pings without a heading are left out meanwhile.
 
     Parameters
     ----------
@@ -176,11 +179,24 @@ class VehicleRuns:
             self._heard[role] = _Stream(stamp_ns, stamp_ns)
             return []
         silence_s = (stamp_ns - held.newest_ns) * 1e-9
-        is_moving = role == "imu" or self._speed_m_s > _AT_REST_M_S
         longest_s = max(self._config.max_gap_s, _DOUBT_PERIODS * held.period_s)
-        if is_moving and silence_s > longest_s:
+        is_lost = role == "imu" or self._may_be_far(silence_s)
+        if is_lost and silence_s > longest_s:
             issued = self.begin(RunBreak(role, held.newest_ns, stamp_ns))
             self._heard[role] = _Stream(stamp_ns, stamp_ns)
             return issued
         held.newest_ns, held.num = max(held.newest_ns, stamp_ns), held.num + 1
         return []
+
+    def _may_be_far(self, silence_s: float) -> bool:
+        """Whether it may be far from where its last velocity leads.
+
+        It is not where that was slow, nor where the vehicle is known to change its velocity
+        little.
+        """
+        if self._speed_m_s <= _AT_REST_M_S:
+            return False
+        # A random walk of the velocity, summed: three standard deviations of the place.
+        walk_m_s = self._config.navigation.velocity_walk_m_s
+        error_m = 3.0 * walk_m_s * silence_s * math.sqrt(silence_s / 3.0)
+        return min(self._speed_m_s * silence_s, error_m) > _FAR_M
