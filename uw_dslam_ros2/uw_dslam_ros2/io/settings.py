@@ -64,7 +64,7 @@ REMOVED = {
         for name, text in (
             ("min_probability", f"write 1 less it as {group}.max_false_accept"),
             ("max_conflict", "it is always 0.4"),
-            ("max_rival_probability", "it is always 0.8"),
+            ("max_rival_probability", f"{group}.max_false_accept counts rivals, too"),
             ("max_slide_share", "the covariance says how free a direction is"),
         )
     },

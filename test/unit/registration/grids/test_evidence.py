@@ -120,8 +120,36 @@ def test_a_rival_as_convincing_is_ambiguous_however_low_its_score():
         replace(GOOD, rivals=(POOR, rival)), GridRegistrationConfig()
     )
     assert verdict is Verdict.AMBIGUOUS
-    assert probability <= 0.5
+    assert probability <= 0.51
     assert "another pose" in reason
+
+
+def test_of_two_poses_that_nothing_tells_apart_each_has_half_of_the_probability():
+    rival = replace(GOOD.best, score=0.4)
+    alone = probability_of(replace(GOOD, rivals=(replace(POOR, score=0.4),)))
+    assert alone > 0.9
+    assert probability_of(replace(GOOD, rivals=(rival,))) == pytest.approx(0.5 * alone, abs=0.01)
+
+
+def test_what_is_stated_does_not_leap_where_a_verdict_turns():
+    """By how much a rival convinces, how much better the source agrees in a mirror, and detail."""
+    config = GridRegistrationConfig()
+
+    def with_rival(share):
+        agreement = _agreement(agreement=0.9 - 0.5 * share, conflict=0.04 + 0.2 * share)
+        return replace(GOOD, rivals=(PoseEvidence(agreement, 0.4, 12.0),))
+
+    def with_decoy(share):
+        return replace(GOOD, decoy=replace(GOOD.best, surprise=6.0 + 30.0 * share))
+
+    def with_detail(share):
+        best = replace(GOOD.best, agreement=_agreement(num_detail=30.0 * share))
+        return replace(GOOD, best=best, decoy=best)
+
+    for change in (with_rival, with_decoy, with_detail):
+        told = [decide(change(share), config) for share in np.linspace(0.0, 1.0, 200)]
+        assert {verdict for verdict, *_ in told} >= {Verdict.ACCEPTED, Verdict.AMBIGUOUS}
+        assert np.abs(np.diff([probability for *_, probability in told])).max() < 0.05
 
 
 @pytest.mark.parametrize("less", [{"agreement": 0.8}, {"num_detail": 2.0}])
@@ -143,7 +171,7 @@ def test_the_same_lead_settles_large_maps_and_leaves_small_ones_open():
     for num_walls in (150, 3000):
         best = replace(GOOD.best, agreement=_agreement(agreement=0.96, num_walls=num_walls))
         rival = replace(best, agreement=replace(best.agreement, agreement=0.92))
-        config = GridRegistrationConfig(max_false_accept=1.0)
+        config = GridRegistrationConfig(max_false_accept=0.3)
         verdicts.append(decide(replace(GOOD, best=best, rivals=(rival,)), config)[0])
     assert verdicts == [Verdict.AMBIGUOUS, Verdict.ACCEPTED]
 

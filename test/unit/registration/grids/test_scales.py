@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.features.grid_filter import clean_cells, coarsen, split
+from uw_dslam_ros2.core.features.grid_filter import NUM_PARTS, clean_cells, coarsen, split
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.grids import preparation
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
+from uw_dslam_ros2.core.registration.grids.judging.agreement import WallMap, measure_agreement
 from uw_dslam_ros2.core.registration.grids.judging.probability import probability_of
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
+from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.map_pairs import MapNoise, MapPair, damage, is_right, make_pair
 from uw_dslam_ros2.sim.map_variants import VARIANTS
 
@@ -23,11 +25,11 @@ def _bent(occupancy: OccupancyMap, bend_cells: float, seed: int) -> OccupancyMap
 
 
 def _judged(pair: MapPair, bend_cells: float) -> tuple[float, float]:
-    """Probability that the best pose is right, and on which cells it was judged [m]."""
+    """How convincing the best pose is, and on which cells it was judged [m]."""
     source, target = _bent(pair.source, bend_cells, 1), _bent(pair.target, bend_cells, 2)
     evidence, poses = match_evidence(source, target)
     assert is_right(pair, poses[0][1])
-    return probability_of(evidence), evidence.cell_m
+    return probability_of(evidence, is_alone=True), evidence.cell_m
 
 
 @pytest.mark.parametrize("place", [("corridors", 0.5, 2), ("office", 0.7, 2)])
@@ -77,6 +79,24 @@ def test_maps_of_large_cells_are_judged_on_smaller_ones(place):
     fine, _ = match_evidence(pair.source, pair.target)
     assert probability_of(evidence) > 0.75
     assert probability_of(fine) > 0.75
+
+
+def test_what_is_said_on_half_cells_is_no_more_than_the_maps_hold():
+    """A thick wall of four cells for each of its own is neither four walls nor detail."""
+    values = np.zeros((80, 80), np.int8)
+    values[20:24, 10:70] = values[10:70, 20:25] = 100
+    cells = clean_cells(OccupancyMap(GridSpec(0.1, 80, 80), values))
+    own, halved = WallMap(cells), WallMap(split(cells), NUM_PARTS)
+    T = SE2(1.0, 0.0, 0.0)  # cells
+    told, again = (
+        measure_agreement(walls, walls, SE2(size * T.x, size * T.y, T.yaw))
+        for walls, size in ((own, 1.0), (halved, 2.0))
+    )
+    assert again.num_walls == pytest.approx(told.num_walls, abs=1)
+    assert told.num_detail < 5.0
+    assert again.num_detail < 5.0
+    assert again.agreement == told.agreement == 1.0
+    assert again.wall_share < told.wall_share  # what they are for
 
 
 def test_split_cells_hold_what_the_whole_ones_held(rng):

@@ -19,7 +19,6 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
 )
 from uw_dslam_ros2.core.registration.grids.judging.verdict import (
     _RULES,
-    MOST_RIVAL_PROBABILITY,
     Proof,
     _Case,
     decide,
@@ -57,6 +56,8 @@ def random_case(rng):
             config,
             max_false_accept=rng.random(), min_overlap=0.4 * rng.random(),
         )  # fmt: skip
+    if rng.random() < 0.5:
+        evidence = replace(evidence, decoy=random_pose(rng))
     proof = Proof(
         is_complete=bool(rng.random() < 0.8), is_optimum=bool(rng.random() < 0.8),
         is_cancelled=bool(rng.random() < 0.05), num_boxes=9, score=0.41, lower_bound=0.5,
@@ -85,13 +86,19 @@ SENTENCES = {
         lambda c, p: 0.4 if p >= 1.0 - c.max_false_accept else 0.24,
         "most",
     ),
-    "another pose agrees as well": (
-        Verdict.AMBIGUOUS,
-        None,  # of a rival
-        lambda _c, _p: MOST_RIVAL_PROBABILITY,
-        "most",
-    ),
     "another pose agrees about as well": (
+        Verdict.AMBIGUOUS,
+        lambda _, p: p,
+        lambda c, _: 1.0 - c.max_false_accept,
+        "least",
+    ),
+    "in a mirror the source agrees better": (
+        Verdict.AMBIGUOUS,
+        lambda _, p: p,
+        lambda c, _: 1.0 - c.max_false_accept,
+        "least",
+    ),
+    "nothing but straight walls agrees": (
         Verdict.AMBIGUOUS,
         lambda _, p: p,
         lambda c, _: 1.0 - c.max_false_accept,
@@ -125,7 +132,7 @@ def test_each_sentence_states_the_numbers_that_decided(rng):
         evidence, config, proof = random_case(rng)
         verdict, reason, stated = decide(evidence, config, proof=proof)
         probability = probability_of(evidence)
-        assert 0.0 <= stated <= probability
+        assert stated == (0.0 if verdict is Verdict.TOO_FEW_FEATURES else probability)
         begin = next((text for text in SENTENCES if reason.startswith(text)), None)
         if begin is None:
             seen[verdict, reason.split(",")[0][:20] if verdict != Verdict.ACCEPTED else ""] += 1
@@ -173,8 +180,6 @@ def test_every_line_of_the_table_can_decide(rng):
         evidence, config, proof = random_case(rng)
         if rng.random() < 0.01:
             evidence = replace(evidence, deviation_m=math.nan)
-        if rng.random() < 0.5:
-            evidence = replace(evidence, decoy=random_pose(rng))
         case = _Case(evidence, config, MODELS, proof)
         deciding.add(_RULES.index(first_that_applies(_RULES, case)))
     assert deciding == set(range(len(_RULES)))

@@ -17,14 +17,13 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.special import expit
+from scipy.special import expit, log_expit
 
 from uw_dslam_ros2.cli.studies._apart_maps import apart_maps
 from uw_dslam_ros2.cli.studies._common import (
@@ -49,9 +48,9 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
     match_features,
     pose_features,
     probability_of,
-    rival_probability,
+    share_left_by_doubts,
 )
-from uw_dslam_ros2.core.registration.grids.judging.verdict import MOST_RIVAL_PROBABILITY, decide
+from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.result import Verdict
 
@@ -62,9 +61,11 @@ _CHECK_KINDS = ("oblique", "cellular", "cave", "corridors", "harbour", "symmetri
 _OVERLAPS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _FIRST_CHECK = 1000
 _RIDGE = 1.0
-# Slopes of windows with and without priors, and of places that look like themselves: held where
-# few pairs are of such.
-_HELD_SLOPES = {"log_volume": -0.2288, "rival": -1.1911}
+# Which way a feature may speak, if at all; where few pairs tell, chance must not turn it round.
+_SIGNS = {
+    "agreement": 1, "conflict": -1, "log_detail": 1, "wall_share": -1, "log_surprise": 1,
+    "log_volume": -1, "pose": 1, "lead": 1,
+}  # fmt: skip
 _OTHER_WEIGHT = 0.3  # of poses beside that of the highest score: there are several in each pair
 _APART_BINS = (0.05, 0.2, 0.4, 0.5, 1.01)
 _NUM_VEHICLES = 4  # maps of each place
@@ -138,7 +139,8 @@ def _fitted(trials: list[Trial]) -> VerdictModels:
     """Both models, one after the other.
 
     A pose in a symmetric place is convincing for itself wherever it is: there, rivals decide. The
-    second model is of the matches that no convincing rival makes ambiguous anyway.
+    second model is of matches that nothing explains otherwise, and which those are nobody knows:
+    so it is fitted to what its probability comes to beside aliases and mirror.
     """
     features, is_right, weights = [], [], []
     trial_weights = weights_of(trials)
@@ -151,18 +153,14 @@ def _fitted(trials: list[Trial]) -> VerdictModels:
             features.append(pose_features(one, trial.evidence.log_volume))
             is_right.append(is_pose_right)
             weights.append(weight * (1.0 if one.score == highest else _OTHER_WEIGHT))
-    pose = _logistic(POSE_FEATURES, features, is_right, weights)
+    pose = _logistic(POSE_FEATURES, features, is_right, weights, [1.0] * len(features))
     alone = VerdictModels(pose, ())
-    left = [
-        (trial, weight)
-        for trial, weight in zip(trials, trial_weights, strict=True)
-        if rival_probability(trial.evidence, alone) <= MOST_RIVAL_PROBABILITY
-    ]
     match = _logistic(
         MATCH_FEATURES,
-        [match_features(trial.evidence, pose) for trial, _ in left],
-        [trial.is_right for trial, _ in left],
-        [weight for _, weight in left],
+        [match_features(trial.evidence, pose) for trial in trials],
+        [trial.is_right for trial in trials],
+        trial_weights,
+        [share_left_by_doubts(trial.evidence, alone) for trial in trials],
     )
     return VerdictModels(pose, match)
 
@@ -172,28 +170,32 @@ def _logistic(
     rows: list[tuple[float, ...]],
     is_right: list[bool],
     weights: list[float],
+    most: list[float],
 ) -> tuple[float, ...]:
-    """Coefficients, intercept first, of a ridge-regularised logistic model; some are held."""
+    """Coefficients, intercept first, of a ridge-regularised logistic model with `_SIGNS`.
+
+    The probability that a row is right is that of the model times its ``most``.
+    """
     features, answers, weight = np.array(rows), np.array(is_right, float), np.array(weights)
-    held = np.array([_HELD_SLOPES.get(name, math.nan) for name in names])
-    is_free = np.isnan(held)
-    offset = features[:, ~is_free] @ held[~is_free]
-    free = features[:, is_free]
-    mean, spread = free.mean(axis=0), free.std(axis=0) + 1e-9
-    scaled = (free - mean) / spread
+    share = np.array(most)
+    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-9
+    scaled = (features - mean) / spread
 
     def loss(model: FloatArray) -> tuple[float, FloatArray]:
-        logit = offset + model[0] + scaled @ model[1:]
-        value = weight @ (np.logaddexp(0.0, logit) - answers * logit)
-        slope = weight * (expit(logit) - answers)
+        logit = model[0] + scaled @ model[1:]
+        given = expit(logit)
+        wrong = 1.0 - share * given
+        likelihood = answers * log_expit(logit) + (1.0 - answers) * np.log(wrong)
+        slope = weight * ((1.0 - answers) * share * given / wrong - answers) * (1.0 - given)
         ridge = np.concatenate([[0.0], _RIDGE * model[1:]])
         gradient = np.concatenate([[slope.sum()], scaled.T @ slope]) + ridge
-        return float(value + 0.5 * model @ ridge), gradient
+        return float(-weight @ likelihood + 0.5 * model @ ridge), gradient
 
-    found = minimize(loss, np.zeros(1 + is_free.sum()), jac=True, method="L-BFGS-B").x
-    slopes = held.copy()
-    slopes[is_free] = found[1:] / spread
-    intercept = float(found[0] - slopes[is_free] @ mean)
+    bounds = [(0.0, None) if _SIGNS[name] > 0 else (None, 0.0) for name in names]
+    start = np.zeros(1 + len(names))
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(None, None), *bounds]).x
+    slopes = found[1:] / spread
+    intercept = float(found[0] - slopes @ mean)
     return tuple(round(value, 4) for value in (intercept, *map(float, slopes)))
 
 

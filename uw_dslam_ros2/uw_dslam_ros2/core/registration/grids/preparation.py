@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uw_dslam_ros2.core.features.grid_filter import (
+    NUM_PARTS,
     FilteredCells,
     clean_cells,
     coarsen,
@@ -76,7 +77,8 @@ def _scales(finest: Sides) -> list[Sides]:
         ]
         scales.append((WallMap(cells[0]), WallMap(cells[1])))
     if spacing < _ENOUGH_SPACING:
-        scales.insert(0, (WallMap(split(finest[0].cells)), WallMap(split(finest[1].cells))))
+        source, target = (WallMap(split(walls.cells), NUM_PARTS) for walls in finest)
+        scales.insert(0, (source, target))
     return scales
 
 
@@ -92,7 +94,8 @@ def in_a_mirror(walls: WallMap) -> WallMap:
         np.ascontiguousarray(values[:, ::-1])
         for values in (cells.wall, cells.free, cells.known, cells.row, cells.col)
     )
-    return WallMap(FilteredCells(cells.resolution_m, wall, free, known, row, wall.shape[1] - col))
+    image = FilteredCells(cells.resolution_m, wall, free, known, row, wall.shape[1] - col)
+    return WallMap(image, walls.num_copies)
 
 
 def _finest_resolution(source: OccupancyMap, target: OccupancyMap, num_cells: int) -> float:

@@ -25,13 +25,13 @@ class Agreement:
     """What two maps say about each other at a pose.
 
     ``overlap`` is the area seen by both over the smaller seen area. Of the wall cells of either
-    map inside the other's seen area (``num_walls``), ``agreement`` is the share with a wall near
-    and ``conflict`` the share on free space with none near. ``inlier_ratio`` of
-    the source's wall cells have a partner. ``residual_cells`` is the root mean square
-    distance of the partners. ``wall_share`` is the share of the common area that is that near to a
-    wall: what a wall cell dropped anywhere would find. ``num_detail`` of the agreeing wall cells
-    lie off the few straight lines that hold most of them: any room has straight walls, so they
-    tell one place from another.
+    map inside the other's seen area (``num_walls``, copies of one counted once), ``agreement`` is
+    the share with a wall near and ``conflict`` the share on free space with none near.
+    ``inlier_ratio`` of the source's wall cells have a partner. ``residual_cells`` is the root mean
+    square distance of the partners. ``wall_share`` is the share of the common area that is that
+    near to a wall: what a wall cell dropped anywhere would find. ``num_detail`` of the agreeing
+    wall cells lie off the few straight lines that hold most of them: any room has straight walls,
+    so they tell one place from another.
     """
 
     overlap: float
@@ -45,10 +45,13 @@ class Agreement:
 
 
 class WallMap:
-    """Distance to walls, free share and walls of a map, made once for all poses."""
+    """Distance to walls, free share and walls of a map, made once for all poses.
 
-    def __init__(self, cells: FilteredCells) -> None:
-        self.cells = cells
+    ``num_copies`` of its cells hold what one cell of the map does, and count as one.
+    """
+
+    def __init__(self, cells: FilteredCells, num_copies: int = 1) -> None:
+        self.cells, self.num_copies = cells, num_copies
         is_wall = cells.wall > 0.25
         self.distance = wall_distance(cells)
         self.free = cv2.boxFilter(cells.free, -1, (3, 3), borderType=cv2.BORDER_CONSTANT)
@@ -92,25 +95,29 @@ def measure_agreement(source: WallMap, target: WallMap, T_target_source: SE2) ->
         if walls is source:
             inliers = counts[1] / max(len(is_near), 1)
     overlap, wall_share = _common_area(source, target, T_target_source)
+    num_copies = max(source.num_copies, target.num_copies)
     return Agreement(
         overlap,
-        seen,
+        round(seen / num_copies),
         near / max(seen, 1),
         conflict / max(seen, 1),
         inliers,
         float(np.sqrt(square / max(near, 1))),
         wall_share,
-        near * _detail_share(np.concatenate(agreeing)),
+        near / num_copies * _detail_share(np.concatenate(agreeing), math.sqrt(num_copies)),
     )
 
 
-def _detail_share(points: FloatArray) -> float:
-    """Share of points (N, 2) [cells] that lie off the few lines that hold most of them."""
+def _detail_share(points: FloatArray, width: float) -> float:
+    """Share of points (N, 2) [cells] that lie off the few lines that hold most of them.
+
+    A line is ``width`` times as wide as for cells that are as large as those of the maps.
+    """
     if len(points) == 0:
         return 0.0
     some = points[:: -(-len(points) // _MOST_LINE_POINTS)]
     left = off_strongest_lines(
-        np.ascontiguousarray(some), _NUM_LINES, _NUM_LINE_ANGLES, _LINE_HALF_WIDTH_CELLS
+        np.ascontiguousarray(some), _NUM_LINES, _NUM_LINE_ANGLES, width * _LINE_HALF_WIDTH_CELLS
     )
     return float(left.mean())
 

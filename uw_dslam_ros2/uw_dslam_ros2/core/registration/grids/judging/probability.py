@@ -25,6 +25,7 @@ __all__ = [
     "pose_logit",
     "probability_of",
     "rival_probability",
+    "share_left_by_doubts",
 ]
 
 
@@ -85,14 +86,20 @@ POSE_FEATURES = (
     "log_surprise",
     "log_volume",
 )
-MATCH_FEATURES = ("pose", "rival", "lead")
+MATCH_FEATURES = ("pose", "lead")
 _RIVAL_SHARES = (0.2, 2.0)  # beyond, a rival's score says no more
 _MOST_LOGIT = 12.0
+_ONE_OF_TWO = 0.5
+# How often one of two maps has left and right exchanged [logit]: one time in fourteen.
+_MIRRORED = -2.6
+# Where straight walls are all that agrees, accident does as much in a mirror: before anything is
+# seen, its odds are three to two. Each sample of detail speaks against that.
+_BARE = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class VerdictModels:
-    """Logistic models, intercept first: of a pose for itself, and of the best among rivals."""
+    """Logistic models, intercept first: of a pose for itself, and of the best of two maps."""
 
     pose: tuple[float, ...]
     match: tuple[float, ...]
@@ -100,7 +107,7 @@ class VerdictModels:
 
 MODELS = VerdictModels(
     pose=(-1.3292, 1.9783, -20.1197, 0.7012, -4.7006, 2.4299, -0.2288),
-    match=(-0.0502, 0.7661, -1.1911, 1.5554),
+    match=(-0.0502, 0.7661, 1.5554),
 )
 """Fitted by the model fit of `study verdict` on 1,891 answers, each place weighed as one.
 
@@ -108,8 +115,7 @@ MODELS = VerdictModels(
 1,251 of real maps: 264 pairs that were built apart and looked at, 158 windows of lidar maps,
 pairs of different places, and mirror images of all that do not look alike in a mirror. The real
 maps are public ones and no part of this repository; a list of one's own goes to `--pairs`. The
-slopes of ``log_volume`` and ``rival`` are held at what windows with and without priors, and places
-that look like themselves, gave before.
+slope of ``log_volume`` is held at what windows with and without priors gave before.
 """
 
 
@@ -129,15 +135,12 @@ def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
 def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tuple[float, ...]:
     """Quantities that speak for or against the best pose in view of the others.
 
-    Its logit for itself, how convincing its strongest rival is as an alias of it, from 0 up, and
-    the logarithm of how many times it scores any other pose: where two maps do not belong
-    together, their best poses score alike.
+    Its logit for itself, and the logarithm of how many times it scores any other pose: where two
+    maps do not belong together, their best poses score alike.
     """
     best = _logit(pose_model, pose_features(evidence.best, evidence.log_volume))
     least, most = _RIVAL_SHARES
-    lead = -math.log(min(max(evidence.rival_share, least), most))
-    doubted = _most_alike(evidence, pose_model)
-    return best, math.log1p(math.exp(doubted)), lead
+    return best, -math.log(min(max(evidence.rival_share, least), most))
 
 
 def _most_alike(evidence: MatchEvidence, pose_model: Sequence[float]) -> float:
@@ -167,10 +170,22 @@ def probability_of(
 ) -> float:
     """Probability in [0, 1] that the best pose is right.
 
-    ``is_alone`` takes no rival for an alias of the best pose.
+    ``is_alone`` asks only how convincing it is, and for nothing that explains it otherwise.
     """
-    pose, rival, lead = match_features(evidence, models.pose)
-    return _share(_logit(models.match, (pose, 0.0 if is_alone else rival, lead)))
+    alone = _share(_logit(models.match, match_features(evidence, models.pose)))
+    if is_alone:
+        return alone
+    return alone * share_left_by_doubts(evidence, models)
+
+
+def share_left_by_doubts(evidence: MatchEvidence, models: VerdictModels = MODELS) -> float:
+    """What an alias of the best pose and a mirror leave of its probability, in [0, 1].
+
+    Where a place looks like itself, as the strongest rival's own probability says, the best pose
+    is one of two that nothing tells apart.
+    """
+    alias = (1.0 - _ONE_OF_TWO) * rival_probability(evidence, models)
+    return (1.0 - alias) * (1.0 - _mirror_probability(evidence, models))
 
 
 def pose_logit(pose: PoseEvidence, log_volume: float, models: VerdictModels = MODELS) -> float:
@@ -191,6 +206,15 @@ def lead_over_decoy(evidence: MatchEvidence, models: VerdictModels = MODELS) -> 
         pose_logit(pose, evidence.log_volume, models) for pose in (evidence.best, evidence.decoy)
     )
     return best - decoy
+
+
+def _mirror_probability(evidence: MatchEvidence, models: VerdictModels) -> float:
+    """How probable it is that the source is in a mirror, or agrees there by as much accident.
+
+    0 where no decoy was looked for.
+    """
+    bareness = math.exp(-evidence.best.agreement.num_detail / _CELLS_PER_SAMPLE)
+    return _share(_MIRRORED + _BARE * bareness - lead_over_decoy(evidence, models))
 
 
 def _share(logit: float) -> float:

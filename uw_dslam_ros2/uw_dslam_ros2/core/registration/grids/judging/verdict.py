@@ -20,17 +20,13 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.registration.rules import Rule, at_least, at_most, first_that_applies
 
-__all__ = ["MOST_RIVAL_PROBABILITY", "Proof", "decide"]
+__all__ = ["Proof", "decide"]
 
 _MOST_CONFLICT = 0.4  # of the common walls lie on free space
 _IMPROBABLE_CONFLICT = 0.24  # where a match is not probable either, that is why
-MOST_RIVAL_PROBABILITY = 0.8
-"""A rival that by itself is more probable than that makes a match ambiguous."""
 _LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
 _LOOSE_SHARE = 0.1  # of the walls' extent: less sure along its weakest direction is worth saying
-_DECOY_MARGIN = 1.5  # of logits: noise decides on less, in a place that is its own mirror image
 _LEAST_DETAIL = 1.0  # cells: with less, nothing that agrees is off a few straight lines
-_DOUBTED = 0.5  # most probability left to a pose that the maps do not tell from others
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +71,18 @@ class _Case:
 
     @property
     def alone(self) -> float:
-        """Probability without the rivals."""
+        """Probability without what explains the match otherwise."""
         return probability_of(self.evidence, self.models, is_alone=True)
 
     @property
     def is_convincing(self) -> bool:
-        """Rivals only matter to a match that would be accepted without them."""
+        """Whether the match would be accepted if nothing else explained it."""
         return self.alone >= self.least
+
+    @property
+    def beside_rivals(self) -> float:
+        """Probability without the question of a mirror."""
+        return probability_of(replace(self.evidence, decoy=None), self.models)
 
     @property
     def rival(self) -> float:
@@ -170,41 +171,30 @@ _RULES: tuple[Rule[_Case, Verdict], ...] = (
         ),
     ),
     Rule(
-        lambda c: c.is_convincing and c.rival > MOST_RIVAL_PROBABILITY,
+        lambda c: c.is_convincing and c.beside_rivals < c.least,
         Verdict.AMBIGUOUS,
         lambda c: (
-            "another pose agrees as well where it overlaps: if this one were not there, it would "
-            f"be right with probability {at_most(c.rival, MOST_RIVAL_PROBABILITY, '.2f')}"
-            f"; best score of another: {c.evidence.rival_share:.0%} of this one's"
+            f"another pose agrees about as well where it overlaps: beside it, {c.improbable}; "
+            f"if this one were not there, that one would be with {c.rival:.2f}; best score of "
+            f"another: {c.evidence.rival_share:.0%} of this one's"
         ),
-        most_probability=_DOUBTED,
+    ),
+    Rule(
+        lambda c: c.is_convincing and not c.is_probable and not c.is_bare,
+        Verdict.AMBIGUOUS,
+        lambda c: (
+            "in a mirror the source agrees better than as it is, by odds of "
+            f"{math.exp(-c.lead):.1f}: one of the maps may have left and right exchanged, so "
+            f"this is {c.improbable}"
+        ),
     ),
     Rule(
         lambda c: c.is_convincing and not c.is_probable,
         Verdict.AMBIGUOUS,
         lambda c: (
-            f"another pose agrees about as well where it overlaps: beside it, {c.improbable}; "
-            f"without it, {c.alone:.2f}"
-        ),
-        most_probability=_DOUBTED,
-    ),
-    Rule(
-        lambda c: c.is_probable and c.lead < -_DECOY_MARGIN,
-        Verdict.AMBIGUOUS,
-        lambda c: (
-            "in a mirror the source agrees better than as it is, by odds of "
-            f"{math.exp(-c.lead):.1f}: one of the maps may have left and right exchanged"
-        ),
-        most_probability=_DOUBTED,
-    ),
-    Rule(
-        lambda c: c.is_probable and c.is_bare and c.lead < _DECOY_MARGIN,
-        Verdict.AMBIGUOUS,
-        lambda c: (
             "nothing but straight walls agrees, and in a mirror, where no pose is right, they "
-            f"agree about as well; {c.measured}"
+            f"agree about as well: {c.improbable}; {c.measured}"
         ),
-        most_probability=_DOUBTED,
     ),
     Rule(
         lambda c: not c.is_probable and c.is_plain,
@@ -260,7 +250,7 @@ def decide(
             reason += f"; {case.higher}, but the maps speak for this one"
         if not case.proof.is_complete:
             reason += f"; {case.open_gap}"
-    return rule.outcome, reason, min(case.probability, rule.most_probability)
+    return rule.outcome, reason, case.probability
 
 
 def _not_finite(evidence: MatchEvidence, proof: Proof) -> Iterator[str]:
