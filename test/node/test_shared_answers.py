@@ -1,4 +1,4 @@
-"""Managers that only modems join: one vehicle's answers serve the others, byte for byte."""
+"""Managers that only modems join: answers and decisions of one serve the others, byte for byte."""
 
 import contextlib
 
@@ -12,9 +12,9 @@ from nav_msgs.msg import OccupancyGrid
 from places import room_submap
 from rclpy.parameter import Parameter
 from std_msgs.msg import UInt8MultiArray
-from uw_dslam_msgs.msg import MergeStatus
+from uw_dslam_msgs.msg import Decision, MergeStatus
 from uw_dslam_msgs.msg import Submap as SubmapMsg
-from uw_dslam_msgs.srv import RegisterMaps
+from uw_dslam_msgs.srv import Decide, ListDecisions, RegisterMaps
 
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
@@ -72,6 +72,14 @@ class Vehicle:
         found = make_result(T_true @ SE2(self.error_m, 0.0, 0.0))
         response.result, response.registration = response.DONE, registration_to_msg(found)
         return response
+
+    def call(self, until, service, name, **fields):
+        """What the manager answers."""
+        client = self.probe.create_client(service, f"map_queue_manager/{name}")
+        until(client.service_is_ready, name)
+        future = client.call_async(service.Request(**fields))
+        until(future.done, name)
+        return future.result()
 
     @property
     def status(self):
@@ -146,3 +154,34 @@ def test_what_is_no_answer_is_told_and_harms_nothing(fleet):
         until(lambda: first.manager._report()[2].get("num_bad"), "the manager's complaint")
         until(lambda: "verdict of an answer" in first.link._report()[1], "the link's complaint")
         assert first.status.num_registrations == 0
+
+
+def test_what_a_person_decides_at_one_vehicle_holds_at_all(fleet):
+    with fleet((0.0, None)) as (until, (first, second)):
+        until(lambda: second.merged() == set(VEHICLES), "both maps")
+        decided = [
+            Decision(kind=Decision.WITHDRAW, who="Ann", source_vehicle_id="auv_2"),
+            Decision(kind=Decision.UNDO, who="Bob", undone=1),
+        ]
+        for vehicle, decision, merged in (
+            (first, decided[0], {"auv_1"}),
+            (second, decided[1], set(VEHICLES)),
+        ):
+            taken = vehicle.call(until, Decide, "decide", decision=decision)
+            assert taken.result == Decide.Response.DONE, taken.message
+            until(lambda: first.merged() == second.merged() == merged, "the same at both")  # noqa: B023
+        logs = [v.call(until, ListDecisions, "list_decisions").decisions for v in (first, second)]
+        assert [(d.who, d.kind, d.undone) for d in logs[0]] == [("Ann", 1, 0), ("Bob", 8, 1)]
+        assert logs[0] == logs[1]
+        until(lambda: first.map_bytes() == second.map_bytes(), "the same map")
+
+
+def test_what_is_no_decision_is_told_and_harms_nothing(fleet):
+    with fleet((None, None)) as (until, (first, _)):
+        heard = first.probe.create_publisher(
+            UInt8MultiArray, "/auv_1/link/decisions_heard", ANSWERS
+        )
+        until(heard.get_subscription_count)
+        heard.publish(UInt8MultiArray(data=np.full(9, 255, np.uint8).tobytes()))
+        until(lambda: first.manager._report()[2].get("num_bad"), "the manager's complaint")
+        assert first.status.num_decisions == 0

@@ -291,3 +291,24 @@ def test_many_vehicles_fit_their_reports_into_small_packets():
         talk.add(own_submap(number, 0))
     talk.until_all_know(12, 900.0)
     assert max(len(data) for _, _, data in talk.packets) <= 32
+
+
+def test_decisions_come_to_all_before_anything_else_and_once():
+    talk = fleet(num_submaps=1, num=3, loss=0.3)
+    talk.links[1].add_decision(b"forbid")
+    talk.run(20.0)
+    talk.links[1].add_decision(b"forbid")  # a manager that begins again says it again
+    talk.until_all_know(3, 400.0)
+    talk.run(talk.now_s + 60.0)
+    assert [talk.links[n].take_decisions() for n in (1, 2, 3)] == [[], [b"forbid"], [b"forbid"]]
+    assert talk.links[2].take_decisions() == []
+    again = AcousticLink.from_state(LinkConfig(number=2), "auv_2", talk.links[2].to_state())
+    assert again.take_decisions() == [b"forbid"]
+    again.add_decision(b"forbid")  # so does the manager that heard it
+    assert again.num_open(talk.now_s) == 0
+
+
+@pytest.mark.parametrize("decision", [b"", bytes(1001)])
+def test_decisions_without_bounds_are_refused(decision):
+    with pytest.raises(InvalidInputError, match="expected 1 to 1000"):
+        AcousticLink(LinkConfig(number=1), "auv_1").add_decision(decision)

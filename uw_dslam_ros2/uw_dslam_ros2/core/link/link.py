@@ -36,9 +36,12 @@ from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES, Packet, bu
 from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState, ReceivedState
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
-__all__ = ["AcousticLink"]
+__all__ = ["MAX_DECISION_BYTES", "AcousticLink"]
+
+MAX_DECISION_BYTES = 1000
 
 _OUTLINE_RANK, _CELLS_RANK, _ANSWER_RANK, _MOVED_RANK = 0.0, 1.0, 1.5, 1.8
+_DECISION_RANK = -1.0  # seldom, and somebody waits to see what comes of it
 _LAYER_RANKS = {
     Layer.OUTLINE: _OUTLINE_RANK,
     Layer.COARSE: _CELLS_RANK,
@@ -70,7 +73,7 @@ class AcousticLink:
         self._inboxes: dict[int, Inbox] = {}
         self._items: dict[int, dict[int, bytes]] = {}
         self._held = HeldSubmaps(config.number, name, self._key)
-        self._answers: list[bytes] = []
+        self._heard: dict[ItemKind, list[bytes]] = {}  # answers and decisions
         self._heard_s: dict[int, float] = {}
         self._reporting = Reporting(config)
         self._outbox.add(hello_item(name), _OUTLINE_RANK, "hello")
@@ -121,14 +124,32 @@ class AcousticLink:
             Where the bytes are no answer.
         """
         decode_answer(answer)
-        content = bytes([ItemKind.ANSWER]) + answer
-        if all(item.content != content for item in self._outbox.items):
-            self._outbox.add(content, _ANSWER_RANK, "answers")
+        self._tell(bytes([ItemKind.ANSWER]) + answer, _ANSWER_RANK, "answers")
 
     def take_answers(self) -> list[bytes]:
         """Answers that have come since the last call."""
-        taken, self._answers = self._answers, []
-        return taken
+        return self._heard.pop(ItemKind.ANSWER, [])
+
+    def add_decision(self, decision: bytes) -> None:
+        """Tell the others what a person decided; the bytes are the caller's business.
+
+        Raises
+        ------
+        InvalidInputError
+            Where they are none, or too many.
+        """
+        if not 0 < len(decision) <= MAX_DECISION_BYTES:
+            raise InvalidInputError(
+                f"a decision has {len(decision)} bytes, expected 1 to {MAX_DECISION_BYTES}"
+            )
+        content = bytes([ItemKind.DECISION]) + decision
+        # A manager that begins again tells what it had of others, too.
+        if all(content not in items.values() for items in self._items.values()):
+            self._tell(content, _DECISION_RANK, "decisions")
+
+    def take_decisions(self) -> list[bytes]:
+        """Decisions that have come since the last call."""
+        return self._heard.pop(ItemKind.DECISION, [])
 
     def outlines(self) -> dict[tuple[int, int, int], LayeredSubmap]:
         """What is known of all submaps, by sender, run (16 bits) and sequence."""
@@ -137,6 +158,10 @@ class AcousticLink:
     def name_of(self, sender: int) -> str | None:
         """The vehicle with that number; None while it is not known."""
         return self._held.names.get(sender)
+
+    def _tell(self, content: bytes, rank: float, label: str) -> None:
+        if all(item.content != content for item in self._outbox.items):
+            self._outbox.add(content, rank, label)
 
     def _say(self, key: LayerKey, data: bytes) -> None:
         item, content = self._own.get(key), layer_item(key, data)
@@ -312,7 +337,9 @@ class AcousticLink:
                 self._rank_cells()
         elif kind is ItemKind.ANSWER:
             decode_answer(body.rest)  # else it is refused
-            self._answers.append(body.rest)
+            self._heard.setdefault(kind, []).append(body.rest)
+        elif kind is ItemKind.DECISION:
+            self._heard.setdefault(kind, []).append(body.rest)
         else:
             raise InvalidInputError(f"an item of kind {kind.name}, expected one to keep")
 

@@ -33,8 +33,17 @@ _NOT_PAIRWISE = DecisionKind.FORBID, DecisionKind.CONFIRM, DecisionKind.REGISTER
 """The paper's queue of maps takes nothing back, and has no graph to put a constraint into."""
 
 
-def check_decision(decision: Decision, known: Container[SubmapId], mode: str) -> None:
+def check_decision(decision: Decision, known: Container[SubmapId] | None, mode: str) -> None:
     """Refuse what a queue cannot do.
+
+    Parameters
+    ----------
+    decision
+        Any.
+    known
+        Submaps that have come; None: those that it names may come later.
+    mode
+        Of the queue.
 
     Raises
     ------
@@ -43,7 +52,7 @@ def check_decision(decision: Decision, known: Container[SubmapId], mode: str) ->
     """
     for name in ("source", "target"):
         end = getattr(decision, name)
-        if end is not None and end not in known:
+        if known is not None and end is not None and end not in known:
             raise InvalidInputError(f"decision.{name} is {end}, which was never received")
     if mode == "pairwise" and decision.kind in _NOT_PAIRWISE:
         raise InvalidInputError(

@@ -156,14 +156,24 @@ class MapQueue:
             If it names a submap that never came, or undoes what is not in force.
         """
         check_decision(decision, self._submaps, self._config.mode)
-        before, self._now.decisions = self._decisions, self._decisions.added(decision)
-        if before.pin is not None and self._decisions.pin is None:
-            self._now.frame.release()
-        if decision.kind is DecisionKind.UNDO:
-            # What stood because of it would go on to stand.
-            self._now.held = frozenset()
-        self._change_submaps()
+        is_undone = decision.kind is DecisionKind.UNDO
+        self._now.set_decisions(self._decisions.added(decision), keeps=not is_undone)
+        self._requests.questions = []
         return list(self._decisions)[-1]
+
+    def take_decisions(self, log: DecisionLog) -> None:
+        """Have another log in the place of the own one; submaps that it names may come later.
+
+        Raises
+        ------
+        InvalidInputError
+            If it holds what this queue's mode does not have.
+        """
+        for decision in log:
+            check_decision(decision, None, self._config.mode)
+        if tuple(log) != tuple(self._decisions):
+            self._now.set_decisions(log, keeps=False)
+            self._requests.questions = []
 
     def stated_pose(self, source: SubmapId, target: SubmapId) -> tuple[SE2, float, float]:
         """What the answers say of two submaps, for a person to confirm; see `by_hand`."""
@@ -182,8 +192,13 @@ class MapQueue:
         ]
 
     @property
+    def decision_log(self) -> DecisionLog:
+        """All decisions, those included that are undone."""
+        return self._decisions
+
+    @property
     def num_decisions(self) -> int:
-        """Decisions so far, those included that are undone."""
+        """How many these are."""
         return len(self._decisions)
 
     def add_fixes(self, fixes: Sequence[Fix]) -> None:

@@ -42,6 +42,15 @@ class Standing:
         self._library: Library | None = None
         self._plan: Plan | None = None
 
+    def set_decisions(self, log: DecisionLog, *, keeps: bool) -> None:
+        """Have another log; `keeps`: what stood because of the one before goes on to stand."""
+        before, self.decisions = self.decisions, log
+        if before.pin is not None and log.pin is None:
+            self.frame.release()
+        if not keeps:
+            self.held = frozenset()
+        self.change_submaps()
+
     def change_submaps(self) -> None:
         """Submaps or decisions changed."""
         self._library = None

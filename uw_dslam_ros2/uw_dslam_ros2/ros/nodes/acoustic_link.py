@@ -6,6 +6,7 @@ import re
 import secrets
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -69,13 +70,19 @@ class AcousticLinkNode(Node):
         self.create_subscription(
             UInt8MultiArray, "link/answers", self._on_answer, ANSWERS, callback_group=group
         )
+        self._decisions_heard = self.create_publisher(
+            UInt8MultiArray, "link/decisions_heard", ANSWERS
+        )
+        self.create_subscription(
+            UInt8MultiArray, "link/decisions", self._on_decision, ANSWERS, callback_group=group
+        )
         self._submap_topic = self.resolve_topic_name("submap")
         self._wanted: dict[Track, int] = {}
         self._missing = MissingSubmaps(
             self, lambda job: job(), lambda _, msg: self._on_submap(msg)
         )
         self._give(self._link.submaps())
-        self._give_answers()
+        self._give_told()
         self._diagnostics = Diagnostics(self, self._report, self._vehicle_id)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_SAVE_PERIOD_S, self._save, clock=steady, callback_group=group)
@@ -142,12 +149,18 @@ class AcousticLinkNode(Node):
             found = self._link.receive(bytes(msg.data), self._now_s())
         self._save()  # before a report says that it is here
         self._give(found)
-        self._give_answers()
+        self._give_told()
 
     def _on_answer(self, msg: UInt8MultiArray) -> None:
+        self._tell(self._link.add_answer, msg)
+
+    def _on_decision(self, msg: UInt8MultiArray) -> None:
+        self._tell(self._link.add_decision, msg)
+
+    def _tell(self, add: Callable[[bytes], None], msg: UInt8MultiArray) -> None:
         try:
             with self._lock:
-                self._link.add_answer(bytes(msg.data))
+                add(bytes(msg.data))
         except InvalidInputError as error:
             self._complain(str(error))
 
@@ -164,11 +177,12 @@ class AcousticLinkNode(Node):
         for submap in submaps:
             self._output_of(submap).publish(submap_to_msg(submap))
 
-    def _give_answers(self) -> None:
+    def _give_told(self) -> None:
         with self._lock:
-            answers = self._link.take_answers()
-        for answer in answers:
-            self._answers_heard.publish(UInt8MultiArray(data=answer))
+            answers, decisions = self._link.take_answers(), self._link.take_decisions()
+        for output, told in ((self._answers_heard, answers), (self._decisions_heard, decisions)):
+            for data in told:
+                output.publish(UInt8MultiArray(data=data))
 
     def _output_of(self, submap: Submap) -> Publisher:
         name = re.sub(r"\W", "_", submap.vehicle_id, flags=re.ASCII)

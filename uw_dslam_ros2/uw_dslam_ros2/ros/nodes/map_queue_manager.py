@@ -35,6 +35,7 @@ from uw_dslam_ros2.ros.plumbing.queue_requests import QueueRequests
 from uw_dslam_ros2.ros.plumbing.queue_services import QueueServices
 from uw_dslam_ros2.ros.plumbing.running import run_node
 from uw_dslam_ros2.ros.plumbing.session_keeper import SessionKeeper
+from uw_dslam_ros2.ros.plumbing.shared_decisions import SharedDecisions
 from uw_dslam_ros2.ros.plumbing.throttle import Throttle
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 
@@ -90,6 +91,7 @@ class MapQueueManager(ManagedNode):
         self._topics: set[str] = set()
         self._owners: dict[str, str] = {}
         self._requests = QueueRequests(self, self, self._config, self._worker.post)
+        self._shared_decisions = SharedDecisions(self, self._config.link, self, self._worker.post)
         self._missing = MissingSubmaps(
             self, self._worker.post, self._on_submap, lambda text: self._queue.in_words(text)
         )
@@ -238,6 +240,7 @@ class MapQueueManager(ManagedNode):
         self._message = message
         self._is_changed = True
         self._requests.note_change()
+        self._shared_decisions.note_change()
         self._keeper.note_change()
 
     def _tick(self) -> None:
@@ -252,6 +255,7 @@ class MapQueueManager(ManagedNode):
         if not self._idle.is_active(now_s):
             self._maps.rest()
         self._queue.is_growing = self._idle.is_active(now_s)
+        self._shared_decisions.look()
         for notice in self._queue.take_notices():
             self._message = notice
             self.get_logger().warning(self._queue.in_words(notice))

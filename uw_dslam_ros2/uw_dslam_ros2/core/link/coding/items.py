@@ -37,6 +37,7 @@ class ItemKind(enum.IntEnum):
     STATUS = 4
     WHOLE = 5
     """Of a note: an item that needs no cutting."""
+    DECISION = 6
 
 
 @dataclass(frozen=True, slots=True, order=True)
