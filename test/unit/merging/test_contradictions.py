@@ -12,6 +12,7 @@ from uw_dslam_ros2.sim.fleets import (
     Fleet,
     KnowingMatcher,
     answer_all,
+    lawnmower_fleet,
     line_of_poses,
     make_walls,
 )
@@ -129,3 +130,26 @@ def test_of_two_vehicles_nobody_knows_which_one_is_wrong():
     with_half_a_copy(fleet, 8)
     found = states(merged(fleet.submaps.values(), fleet))
     assert SubmapState.SET_ASIDE not in set.union(*found.values())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nobody_is_set_aside_for_the_drift_of_long_lanes(seed):
+    """On half-metre cells, poses are held to a metre: walls that lie closer contradict nobody."""
+    fleet = lawnmower_fleet(3, 50, seed)
+    queue = merged(fleet.submaps.values(), fleet)
+    assert set.union(*states(queue).values()) == {SubmapState.MERGED}
+
+
+def test_lanes_that_share_little_are_tied_where_they_have_drifted_apart():
+    fleet = lawnmower_fleet(4, 20, 0)
+    queue = merged(fleet.submaps.values(), fleet)
+    poses = {r.submap.submap_id: r.T_component_submap for r in queue.submaps()}
+    truth = fleet.T_world_submap
+    errors = [
+        (poses[a].inverse() @ poses[b]).distance_to(truth[a].inverse() @ truth[b])[0]
+        for a in poses
+        for b in poses
+        if a.vehicle_id < b.vehicle_id and truth[a].distance_to(truth[b])[0] < 12.5
+    ]
+    assert len(errors) == 60
+    assert max(errors) < 1.0, "two cells"

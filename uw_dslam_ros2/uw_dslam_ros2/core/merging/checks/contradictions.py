@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.merging.config import VAGUE_CELLS
 from uw_dslam_ros2.core.merging.graph.components import Component
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
@@ -23,7 +25,9 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _CELL_M = 0.5
-"""Walls are compared in such cells and their neighbours: poses are never that wrong by drift."""
+"""Walls are compared in such cells and their neighbours, or in larger ones where the submaps' own
+are coarse: poses are held to `VAGUE_CELLS` of those.
+"""
 _WALL_PERCENT, _FREE_PERCENT = 50, 25
 _MIN_WALLS = 8
 """Cells of wall that others must have seen of a submap, for a judgement."""
@@ -155,7 +159,7 @@ def _contradicted_share(
 
 def _sketch(stored: StoredSubmap) -> _Sketch:
     spec, values = stored.submap.grid.spec, stored.submap.grid.values
-    step = max(1, round(_CELL_M / spec.resolution_m))
+    step = math.ceil(max(_CELL_M / spec.resolution_m - 0.5, VAGUE_CELLS))
     rows, cols = -(-spec.num_rows // step), -(-spec.num_cols // step)
     padded = np.full((rows * step, cols * step), -1, np.int8)
     padded[: spec.num_rows, : spec.num_cols] = values

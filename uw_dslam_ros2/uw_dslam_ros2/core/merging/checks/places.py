@@ -22,8 +22,8 @@ Ends = tuple[SubmapId, SubmapId]
 
 _MIN_SHARE = 0.25
 """Least common area of two submaps, as a share of the smaller, that is worth a check."""
-_MIN_VAGUE_SHARE = 0.4
-"""The same for a further constraint, which nothing depends on."""
+_FULL_SHARE = 0.4
+"""The same for a further constraint: who shares less must be as much vaguer to be worth one."""
 _ROUNDING_M = 1e-6
 _BLOCK = 256
 """Circles that are compared with all others at a time."""
@@ -97,10 +97,14 @@ def vague_places(
         if not _is_apart(source_id, target_id, 2 * num_neighbours + 1):
             continue
         share = _share(library, source_id, target_id, side.between(target_id, source_id))
-        if share >= _MIN_VAGUE_SHARE:
+        if share >= _MIN_SHARE:
             sharing[source_id, target_id] = share
     pairs = [*sharing]
-    cells_m = [library.submaps[end].submap.grid.spec.resolution_m for _, end in pairs]
+    cells_m = [
+        library.submaps[ends[1]].submap.grid.spec.resolution_m
+        * max(1.0, _FULL_SHARE / sharing[ends])
+        for ends in pairs
+    ]
     candidates = [
         (sharing[ends] * sigma, *ends, uncertainty)
         for ends, uncertainty, sigma in _vague(pairs, vague_cells * np.array(cells_m), side, edges)
