@@ -16,6 +16,7 @@ from uw_dslam_ros2.sim.instruments import HEADING_SOURCES
 from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
 from uw_dslam_ros2.sim.places import PLACES
 from uw_dslam_ros2.sim.recording import simulate_mission
+from uw_dslam_ros2.sim.sway import SwayConfig
 from uw_dslam_ros2.sim.turning import TURNING_MESSAGES
 
 __all__ = ["main"]
@@ -77,6 +78,27 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--speed", type=float, default=default.drive.speed_m_s, metavar="M/S")
     parser.add_argument("--heading", choices=HEADING_SOURCES, default="gyro")
+    parser.add_argument(
+        "--roll", type=float, default=0.0, metavar="DEG", help="amplitude of the vehicles' roll"
+    )
+    parser.add_argument("--pitch", type=float, default=0.0, metavar="DEG", help="of their pitch")
+    parser.add_argument(
+        "--tilt", type=float, default=0.0, metavar="DEG", help="how far the sonars look down"
+    )
+    parser.add_argument(
+        "--depth-step",
+        type=float,
+        default=default.depth_step_m,
+        metavar="M",
+        help="each vehicle cruises so much deeper than the one before",
+    )
+    parser.add_argument(
+        "--crosstalk",
+        type=float,
+        default=default.crosstalk_share,
+        metavar="SHARE",
+        help="part of the pings in which one of another vehicle is heard",
+    )
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
     parser.add_argument(
         "--processes", type=int, default=os.cpu_count() or 1, help="the result is the same"
@@ -110,6 +132,13 @@ def _config(arguments: argparse.Namespace) -> MissionConfig:
             max_range_m=arguments.max_range or default.turning.max_range_m,
         ),
         drive=replace(default.drive, speed_m_s=arguments.speed),
+        sway=SwayConfig(
+            roll_rad=math.radians(arguments.roll),
+            pitch_rad=math.radians(arguments.pitch),
+            sonar_tilt_rad=math.radians(arguments.tilt),
+        ),
+        depth_step_m=arguments.depth_step,
+        crosstalk_share=arguments.crosstalk,
         instruments=replace(
             default.instruments, heading_source=arguments.heading, imu_delay_s=arguments.imu_delay
         ),

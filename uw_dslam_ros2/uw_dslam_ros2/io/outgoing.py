@@ -144,16 +144,19 @@ class MessageFactory:
         variance: float,
         altitude_m: float,
     ) -> Any:
-        """``marine_acoustic_msgs/Dvl`` of a velocity (2,) in FLU axes; None: bottom lock lost."""
+        """``marine_acoustic_msgs/Dvl`` of a velocity (2,) or (3,) in FLU axes; None: no lock."""
         is_locked = velocity_flu_m_s is not None
-        forward, left = velocity_flu_m_s if velocity_flu_m_s is not None else (math.nan, math.nan)
+        forward = left = down = math.nan
+        if velocity_flu_m_s is not None:
+            forward, left, *upwards = velocity_flu_m_s
+            down = -upwards[0] if upwards else 0.0
         covariance = np.diag([variance] * 3).reshape(-1) if is_locked else np.full(9, -1.0)
         return self.make(
             "marine_acoustic_msgs/msg/Dvl",
             header=self.header(stamp_ns, frame_id),
             velocity_mode=_DVL_MODE_BOTTOM,
             dvl_type=0,
-            velocity=self.vector(forward, -left, 0.0 if is_locked else math.nan),
+            velocity=self.vector(forward, -left, down),
             velocity_covar=covariance,
             altitude=float(altitude_m) if is_locked else math.nan,
             course_gnd=math.atan2(-left, forward),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,19 @@ from uw_dslam_ros2.sim.clutter import ClutterConfig, MovingClutter
 from uw_dslam_ros2.sim.instruments import InstrumentConfig, NavigationLog, measure
 from uw_dslam_ros2.sim.paths import SurveyArea, plan_survey, split_areas
 from uw_dslam_ros2.sim.places import PLACES, make_place
-from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
-from uw_dslam_ros2.sim.turning import TurningSonarConfig, TurningSonarSimulator
+from uw_dslam_ros2.sim.sonar import Intruder, SonarConfig, SonarSimulator
+from uw_dslam_ros2.sim.sonar_model import power_of_db
+from uw_dslam_ros2.sim.sway import SwayConfig, fan_in_space, rotation_level_base
+from uw_dslam_ros2.sim.turning import (
+    TurningSonarConfig,
+    TurningSonarSimulator,
+    beam_bearing_rad,
+)
 from uw_dslam_ros2.sim.vehicle import DriveConfig, Motion, drive
 from uw_dslam_ros2.sim.world import World
 
 __all__ = [
+    "SONAR_HEIGHT_M",
     "SONAR_KINDS",
     "T_BASE_DVL",
     "T_BASE_SONAR",
@@ -42,6 +49,8 @@ _START_NS = 1_700_000_000 * _NS
 
 T_BASE_SONAR = SE2(0.30, 0.0, 0.0)
 """Where the sonar sits on every vehicle, looking ahead."""
+SONAR_HEIGHT_M = -0.10
+"""And how high."""
 T_BASE_DVL = SE2(-0.10, 0.05, 0.0)
 """Where the DVL sits."""
 
@@ -70,6 +79,16 @@ class MissionConfig(Config):
     drive: DriveConfig = setting(DriveConfig())
     instruments: InstrumentConfig = setting(InstrumentConfig())
     clutter: ClutterConfig = setting(ClutterConfig())
+    sway: SwayConfig = setting(SwayConfig())
+    depth_step_m: float = setting(
+        0.0, -20.0, 20.0, "each vehicle cruises so much deeper than the one before [m]"
+    )
+    crosstalk_share: float = setting(
+        0.0, 0.0, 1.0, "part of the pings in which one of another vehicle is heard, 1"
+    )
+    crosstalk_db: float = setting(
+        10.0, -60.0, 60.0, "how loud that is, in the beam that looks at that vehicle [dB]"
+    )
 
     @property
     def is_turning(self) -> bool:
@@ -165,7 +184,9 @@ def _run(config: MissionConfig, world: World, area: SurveyArea, index: int) -> V
     route = plan_survey(world, area, length_m, config.clearance_m, rng)
     # Vehicles do not start at the same moment.
     start_ns = _START_NS + index * 370_000_000
-    motion = drive(route, start_ns, config.duration_s, config.drive, rng)
+    how = config.drive
+    how = replace(how, depth_m=how.depth_m + index * config.depth_step_m)
+    motion = drive(route, start_ns, config.duration_s, how, rng)
     log = measure(motion, config.instruments, T_BASE_DVL, rng, world)
     first = start_ns + int(rng.integers(50_000_000, 150_000_000))
     pings = np.arange(first, motion.stamp_ns[-1], config.ping_interval_ns)
@@ -202,12 +223,44 @@ class PingMaker:
         run = self._mission.runs[vehicle]
         motion, stamp_ns = run.ping_motion, int(run.ping_motion.stamp_ns[index])
         rng = np.random.default_rng([self._mission.config.seed, 20, vehicle, index])
-        place = motion.pose(index) @ run.T_base_sonar
+        config = self._mission.config
+        turn = SE2()
+        if config.is_turning:
+            turn = SE2(yaw=beam_bearing_rad(config.turning, index))
+        if config.sway.is_level:
+            place, rotation = motion.pose(index) @ run.T_base_sonar @ turn, None
+        else:
+            T_level_fan, rotation = fan_in_space(
+                rotation_level_base(*config.sway.at(stamp_ns)[:2]),
+                run.T_base_sonar @ turn,
+                SONAR_HEIGHT_M,
+                config.sway.sonar_tilt_rad,
+            )
+            place = motion.pose(index) @ T_level_fan
         depth_m = float(motion.depth_m[index])
         clutter = self._clutter.at((stamp_ns - _START_NS) / _NS)
-        if self._mission.config.is_turning:
-            return self._turning[vehicle].beam(stamp_ns, index, place, depth_m, rng, clutter)
-        return self._fans[vehicle].ping(stamp_ns, place, depth_m, rng, clutter)
+        intruder = self._intruder(vehicle, index, place)
+        if config.is_turning:
+            return self._turning[vehicle].beam(
+                stamp_ns, index, place, depth_m, rng, clutter, rotation, intruder
+            )
+        return self._fans[vehicle].ping(stamp_ns, place, depth_m, rng, clutter, rotation, intruder)
+
+    def _intruder(self, vehicle: int, index: int, T_map_fan: SE2) -> Intruder | None:
+        """Another vehicle's ping: its sonar runs by itself, so that it comes at any time."""
+        config, runs = self._mission.config, self._mission.runs
+        if config.crosstalk_share == 0.0 or len(runs) < 2:
+            return None
+        rng = np.random.default_rng([config.seed, 30, vehicle, index])
+        if rng.random() >= config.crosstalk_share:
+            return None
+        others = [i for i in range(len(runs)) if i != vehicle]
+        other = runs[others[int(rng.integers(len(others)))]]
+        stamp_ns = runs[vehicle].ping_motion.stamp_ns[index : index + 1]
+        seen = T_map_fan.inverse() @ other.motion.at(stamp_ns).pose(0)
+        range_m = float(rng.uniform(0.0, config.field_of_view[1]))
+        bearing_rad = math.atan2(seen.y, seen.x)
+        return Intruder(bearing_rad, range_m, power_of_db(config.crosstalk_db))
 
     def pings(self, vehicle: int, indices: range) -> Iterator[SonarImage]:
         """Images of several pings of one vehicle."""

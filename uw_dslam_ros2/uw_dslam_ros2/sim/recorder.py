@@ -15,7 +15,14 @@ from uw_dslam_ros2.core.sonar.detect import image_echoes
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.recordings import BagWriter
-from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, Mission, VehicleRun
+from uw_dslam_ros2.sim.mission import (
+    SONAR_HEIGHT_M,
+    T_BASE_DVL,
+    T_BASE_SONAR,
+    Mission,
+    VehicleRun,
+)
+from uw_dslam_ros2.sim.sway import body_rates, rotation_level_base
 from uw_dslam_ros2.sim.turning import counted_rad
 
 __all__ = ["TRUTH_STEP", "VehicleRecorder"]
@@ -30,6 +37,9 @@ TRUTH_STEP = 5
 _SONAR_ROTATION = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 _DVL_ROTATION = (1.0, 0.0, 0.0, 0.0)
 _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+_HEAVE_NS = 100_000_000
+
+_Quaternion = tuple[float, float, float, float]
 
 
 class VehicleRecorder:
@@ -76,8 +86,10 @@ class VehicleRecorder:
         who = self._run.vehicle_id
         # A scan's axes are x ahead, y to port.
         rotation = _NO_ROTATION if self._config.is_turning else _SONAR_ROTATION
+        if tilt_rad := self._config.sway.sonar_tilt_rad:
+            rotation = _tilted(rotation, tilt_rad)
         mounts = [
-            (f"{who}/sonar", (T_BASE_SONAR.x, T_BASE_SONAR.y, -0.10), rotation),
+            (f"{who}/sonar", (T_BASE_SONAR.x, T_BASE_SONAR.y, SONAR_HEIGHT_M), rotation),
             (f"{who}/dvl", (T_BASE_DVL.x, T_BASE_DVL.y, -0.15), _DVL_ROTATION),
             (f"{who}/imu", (0.0, 0.0, 0.0), _NO_ROTATION),
             (f"{who}/depth", (0.0, 0.0, 0.0), _NO_ROTATION),
@@ -167,11 +179,20 @@ class VehicleRecorder:
             float(log.yaw_rate_rad_s[index]),
             instruments.gyro_noise_rad_s**2,
         )
+        if not self._config.sway.is_steady:
+            sway = self._config.sway.at(stamp_ns - round(instruments.imu_delay_s * 1e9))
+            message.orientation = self._make.quaternion(
+                _leaning_quaternion(sway[0], sway[1], float(log.yaw_rad[index]))
+            )
+            rates = body_rates(sway, float(log.yaw_rate_rad_s[index]))
+            message.angular_velocity = self._make.vector(*rates)
         self._writer.write(f"/{self._run.vehicle_id}/imu", stamp_ns, message)
 
     def _write_dvl(self, stamp_ns: int, index: int) -> None:
         velocity = self._run.navigation.dvl_velocity_m_s[index]
         motion = self._run.motion
+        if not self._config.sway.is_steady:
+            velocity = self._leaning(stamp_ns, velocity)
         message = self._make.dvl(
             stamp_ns,
             f"{self._run.vehicle_id}/dvl",
@@ -180,6 +201,15 @@ class VehicleRecorder:
             self._water_depth_m - float(np.interp(stamp_ns, motion.stamp_ns, motion.depth_m)),
         )
         self._writer.write(f"/{self._run.vehicle_id}/dvl", stamp_ns, message)
+
+    def _leaning(self, stamp_ns: int, velocity_m_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Velocity (3,) along the axes of a vehicle that leans, of one in its level frame."""
+        motion = self._run.motion
+        around = np.array([stamp_ns - _HEAVE_NS, stamp_ns + _HEAVE_NS])
+        depth_m = np.interp(around, motion.stamp_ns, motion.depth_m)
+        up_m_s = float(depth_m[0] - depth_m[1]) / (2e-9 * _HEAVE_NS)
+        R_level_base = rotation_level_base(*self._config.sway.at(stamp_ns)[:2])
+        return np.asarray(R_level_base.T @ np.append(velocity_m_s, up_m_s))
 
     def _write_depth(self, stamp_ns: int, index: int) -> None:
         message = self._make.pressure(
@@ -202,3 +232,18 @@ class VehicleRecorder:
             float(motion.yaw_rate_rad_s[index]),
         )
         self._writer.write(f"/{self._run.vehicle_id}/truth/odom", stamp_ns, message)
+
+
+def _leaning_quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> _Quaternion:
+    """Orientation [x, y, z, w]: roll about x, then pitch about y, then yaw about z."""
+    sin, cos = math.sin(0.5 * roll_rad), math.cos(0.5 * roll_rad)
+    x, y, z, w = _tilted((sin, 0.0, 0.0, cos), pitch_rad)
+    sin, cos = math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)
+    return cos * x - sin * y, cos * y + sin * x, cos * z + sin * w, cos * w - sin * z
+
+
+def _tilted(rotation: _Quaternion, tilt_rad: float) -> _Quaternion:
+    """A quaternion [x, y, z, w] turned about the y axis to port: bow down."""
+    x, y, z, w = rotation
+    sin, cos = math.sin(0.5 * tilt_rad), math.cos(0.5 * tilt_rad)
+    return cos * x + sin * z, cos * y + sin * w, cos * z - sin * x, cos * w - sin * y

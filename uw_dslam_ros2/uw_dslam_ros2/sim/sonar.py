@@ -9,6 +9,7 @@ is even).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +30,25 @@ from uw_dslam_ros2.sim.sonar_model import (
 )
 from uw_dslam_ros2.sim.world import RayHits, World
 
-__all__ = ["SonarConfig", "SonarSimulator"]
+__all__ = ["Intruder", "SonarConfig", "SonarSimulator"]
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 _RAYS_PER_BEAM = 4
 _DYNAMIC_POWER = 0.25
+_TWO_WAY = 0.5 / math.sqrt(2.0)
+"""Half of a beam's height that counts for an echo: it was sent through it and received."""
+
+
+@dataclass(frozen=True, slots=True)
+class Intruder:
+    """A ping of another vehicle, heard in the middle of an own one."""
+
+    bearing_rad: float
+    range_m: float
+    """Where it seems to be, by the time at which it comes."""
+    power: float
 
 
 class SonarSimulator:
@@ -81,9 +94,16 @@ class SonarSimulator:
         depth_m: float,
         rng: np.random.Generator,
         clutter: Scatterers | None = None,
+        R_level_fan: FloatArray | None = None,
+        intruder: Intruder | None = None,
     ) -> SonarImage:
-        """Return the 8-bit image of one ping from a pose in the world and a depth."""
-        power = self._mean_power(T_map_sonar, depth_m, rng, clutter)
+        """Return the 8-bit image of one ping from a pose in the world and a depth.
+
+        ``R_level_fan`` (3, 3) is that of `sway.fan_in_space`; None: the fan is level.
+        """
+        power = self._mean_power(T_map_sonar, depth_m, rng, clutter, R_level_fan)
+        if intruder is not None:
+            self._add_intruder(power, intruder)
         speckle = filter_beams(
             rng.standard_normal((2, *power.shape), dtype=np.float32), self._speckle_taps
         )
@@ -100,12 +120,16 @@ class SonarSimulator:
         depth_m: float,
         rng: np.random.Generator,
         clutter: Scatterers | None,
+        R_level_fan: FloatArray | None,
     ) -> Float32Array:
         """Mean echo power (R, B), before speckle."""
         config, world = self.config, self._world
+        azimuth_rad, elevation_rad = self._ray_rad, None
+        if R_level_fan is not None:
+            azimuth_rad, elevation_rad = _directions(R_level_fan, self._ray_rad)
         hits = world.cast(
             (T_map_sonar.x, T_map_sonar.y),
-            T_map_sonar.yaw + self._ray_rad,
+            T_map_sonar.yaw + azimuth_rad,
             config.max_range_m / self._range_scale,
         )
         # From here on ranges are as the instrument measures them.
@@ -113,7 +137,18 @@ class SonarSimulator:
         power = np.zeros((config.num_beams, config.num_ranges), dtype=np.float32)
         strength = self._echo_strength(hits)
         altitude_m = world.water_depth_m - depth_m
-        self._add_walls(power, ranges, hits.cos_incidence, strength, min(depth_m, altitude_m))
+        if elevation_rad is None:
+            self._add_walls(power, ranges, hits.cos_incidence, strength, min(depth_m, altitude_m))
+            bed = seabed_power(config, self.range_m, altitude_m)
+            beds = np.broadcast_to(bed, power.shape)
+        else:
+            limits_m = (altitude_m, depth_m)
+            ranges, strength = self._add_slanted(
+                power, ranges, hits.cos_incidence, strength, elevation_rad, limits_m
+            )
+            assert R_level_fan is not None
+            beams = _directions(R_level_fan, self.bearing_rad)[1]
+            beds = np.stack([seabed_power(config, self.range_m, altitude_m, e) for e in beams])
         self._add_ghosts(power, ranges, hits.cos_incidence, strength, depth_m, rng)
         if clutter is not None:
             self._add_clutter(power, ranges, T_map_sonar, clutter)
@@ -124,7 +159,7 @@ class SonarSimulator:
             T_map_sonar.yaw + self.bearing_rad,
             self._first_ray,
             _RAYS_PER_BEAM,
-            seabed_power(config, self.range_m, altitude_m),
+            np.ascontiguousarray(beds),
             self._texture,
             (world.bounds[0], world.bounds[1]),
             0.5 * config.seabed_patch_m,
@@ -193,6 +228,52 @@ class SonarSimulator:
         width = spread + config.pulse_length_m
         self._add(power, self._ray_rad, near, strength, width, tail, len(self._response))
 
+    def _add_slanted(
+        self,
+        power: Float32Array,
+        ranges: FloatArray,
+        cos_incidence: FloatArray,
+        strength: FloatArray,
+        elevation_rad: FloatArray,
+        limits_m: tuple[float, float],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Direct echoes of beams that look up or down (K,), as far as a wall is in their height.
+
+        ``ranges`` are horizontal; a wall reaches `limits_m` below and above the sonar. Returns the
+        slant ranges to the middle of what is seen of the walls, and its strength.
+        """
+        config = self.config
+        half = _TWO_WAY * config.vertical_width_rad
+        near = np.where(np.isfinite(ranges), ranges, 1.0)
+        low = np.maximum(elevation_rad - half, -np.arctan2(limits_m[0], near))
+        high = np.minimum(elevation_rad + half, np.arctan2(limits_m[1], near))
+        is_seen = np.isfinite(ranges) & (high > low)
+        nearest = np.where((low < 0.0) & (high > 0.0), 0.0, np.minimum(abs(low), abs(high)))
+        first = near / np.cos(nearest)
+        last = near / np.cos(np.maximum(abs(low), abs(high)))
+        slant = np.where(is_seen, 0.5 * (first + last), np.inf)
+        seen = np.where(is_seen, strength * (high - low) / (2.0 * half), 0.0)
+        tangent = np.sqrt(1.0 / np.clip(cos_incidence, 0.05, 1.0) ** 2 - 1.0)
+        spread = np.minimum(near * self._ray_step * tangent, 1.5)
+        width = spread + config.pulse_length_m + (last - first)
+        tail = np.zeros(len(near))
+        self._add(power, self._ray_rad, slant, seen, width, tail, len(self._response))
+        return slant, seen
+
+    def _add_intruder(self, power: Float32Array, intruder: Intruder) -> None:
+        """A short flash in all beams that hear its direction, by their side lobes too."""
+        flash = np.zeros(power.shape[::-1], dtype=np.float32)
+        self._add(
+            flash,
+            np.array([intruder.bearing_rad]),
+            np.array([intruder.range_m]),
+            np.array([intruder.power / float(self._response[0])]),
+            np.array([2.0 * self.config.pulse_length_m]),
+            np.zeros(1),
+            len(self._response),
+        )
+        power += flash.T
+
     def _add_ghosts(
         self,
         power: Float32Array,
@@ -240,3 +321,10 @@ class SonarSimulator:
             np.zeros(int(is_seen.sum())),
             self._num_near,
         )
+
+
+def _directions(R_level_fan: FloatArray, bearing_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Azimuth and elevation (K,) [rad] in the level frame of bearings in the fan's plane."""
+    fan = np.stack([np.cos(bearing_rad), np.sin(bearing_rad), np.zeros(len(bearing_rad))])
+    x, y, z = R_level_fan @ fan
+    return np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0))

@@ -80,14 +80,14 @@ def add_seabed(
     texture_step_m: float,
     bin_m: float,
 ) -> None:
-    """Add the seabed, beam by beam, as far as its rays are not yet stopped by a wall."""
+    """Add the seabed of ``level`` (B, R), as far as a beam's rays are not stopped by a wall."""
     num_beams, num_ranges = power.shape
     num_rows, num_cols = texture.shape
     for beam in range(num_beams):
         cos, sin = math.cos(beam_yaws[beam]), math.sin(beam_yaws[beam])
         begin = first_ray + beam * rays_per_beam
         for b in range(num_ranges):
-            if level[b] <= 0.0:
+            if level[beam, b] <= 0.0:
                 continue
             r = (b + 0.5) * bin_m
             num_open = 0
@@ -105,7 +105,7 @@ def add_seabed(
             col0, col1 = col % num_cols, (col + 1) % num_cols
             value = (1.0 - v) * ((1.0 - u) * texture[row0, col0] + u * texture[row0, col1])
             value += v * ((1.0 - u) * texture[row1, col0] + u * texture[row1, col1])
-            power[beam, b] += level[b] * value * num_open / rays_per_beam
+            power[beam, b] += level[beam, b] * value * num_open / rays_per_beam
 
 
 @njit(cache=True, nogil=True)

@@ -98,10 +98,15 @@ def noise_power(config: SonarConfig, range_m: FloatArray) -> Float32Array:
     return (gained + power_of_db(config.noise_floor_db)).astype(np.float32)
 
 
-def seabed_power(config: SonarConfig, range_m: FloatArray, altitude_m: float) -> Float32Array:
-    """Mean power (R,) of an even seabed: Lambert's law inside the vertical beam pattern."""
+def seabed_power(
+    config: SonarConfig, range_m: FloatArray, altitude_m: float, elevation_rad: float = 0.0
+) -> Float32Array:
+    """Mean power (R,) of an even seabed: Lambert's law inside the vertical beam pattern.
+
+    ``elevation_rad`` is where the middle of the beam looks, above the horizontal.
+    """
     sine = np.clip(altitude_m / np.maximum(range_m, altitude_m), 0.0, 1.0)
-    down = np.arcsin(sine) / config.vertical_width_rad
+    down = (np.arcsin(sine) + elevation_rad) / config.vertical_width_rad
     # Twice: sent and received.
     pattern = np.exp(-8.0 * math.log(2.0) * down**2)
     level = power_of_db(config.seabed_db) * 2.0 * sine**1.5 * pattern

@@ -6,12 +6,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.sim.clutter import Scatterers
-from uw_dslam_ros2.sim.sonar import SonarSimulator
+from uw_dslam_ros2.sim.sonar import Intruder, SonarSimulator
 from uw_dslam_ros2.sim.sonar_model import SonarConfig
 from uw_dslam_ros2.sim.world import World
 
@@ -22,6 +23,8 @@ __all__ = [
     "beam_bearing_rad",
     "counted_rad",
 ]
+
+FloatArray = NDArray[np.float64]
 
 TURNING_MESSAGES = ("beam", "turn", "points")
 """What a message of the sonar can hold."""
@@ -90,14 +93,16 @@ class TurningSonarSimulator:
         self,
         stamp_ns: int,
         index: int,
-        T_map_sonar: SE2,
+        T_map_beam: SE2,
         depth_m: float,
         rng: np.random.Generator,
         clutter: Scatterers | None = None,
+        R_level_fan: FloatArray | None = None,
+        intruder: Intruder | None = None,
     ) -> SonarImage:
-        """Return the 8-bit intensities (R, 1) of one beam."""
+        """Return the 8-bit intensities (R, 1) of one beam, from where it looks; see `ping`."""
         bearing = beam_bearing_rad(self._config, index)
-        fan = self._fan.ping(stamp_ns, T_map_sonar @ SE2(yaw=bearing), depth_m, rng, clutter)
+        fan = self._fan.ping(stamp_ns, T_map_beam, depth_m, rng, clutter, R_level_fan, intruder)
         middle = _FAN_BEAMS // 2
         return SonarImage(
             stamp_ns, fan.intensity[:, middle : middle + 1], fan.range_m, np.array([bearing])
