@@ -161,6 +161,55 @@ def test_time_goes_back_by_the_keys(page):
     page.get_by_text("1 of 4 submaps").wait_for()
 
 
+def test_time_plays_by_itself_to_the_newest_and_stops_there(page):
+    page.evaluate(
+        """() => {
+            const told = document.getElementById("moment-text");
+            window.told = [];
+            const note = () => window.told.push(told.textContent);
+            new MutationObserver(note).observe(told, { childList: true });
+        }"""
+    )
+    play = page.locator("#play")
+    play.click()
+    page.wait_for_function("() => window.told.length >= 5")
+    assert [text.split(" · ")[-1] for text in page.evaluate("window.told")] == [
+        "before the first submap",
+        *(f"{number} of 4 submaps" for number in range(1, 5)),
+    ]
+    assert play.get_attribute("aria-label") == "Play"
+
+
+def test_a_cell_is_told_where_the_mouse_rests_and_by_the_keys(page):
+    # Where a vehicle was, it saw something.
+    spot = """() => {
+        const map = window.uwView.map;
+        const own = window.uwView.scene.vehicles.find((v) => v.name === "auv_1");
+        const piece = own.track[0].xy;
+        const [x, y] = piece[piece.length >> 1];
+        map.setView([y, x], 4, { animate: false });
+        const box = map.getContainer().getBoundingClientRect();
+        return [box.x + box.width / 2, box.y + box.height / 2];
+    }"""
+    x, y = page.evaluate(spot)
+    page.mouse.move(x - 3, y)
+    page.mouse.move(x, y)
+    page.locator(".map-note", has_text="free: auv_1/0").wait_for()
+    page.locator("#map").focus()
+    page.keyboard.press("Enter")
+    page.get_by_role("tab", name="Cell", selected=True).wait_for()
+    page.get_by_text("submaps say wall").wait_for()
+
+
+def test_lines_of_matches_are_explained(page):
+    layers = page.locator(".layers")
+    if layers.get_attribute("open") is None:
+        layers.locator("summary").click()
+    layers.get_by_text("holds", exact=True).wait_for()
+    layers.get_by_label("matches").uncheck()
+    assert page.evaluate("!window.uwView.map.hasLayer(window.uwView.groups.constraints)")
+
+
 def test_tabs_are_reached_by_the_keys(page):
     page.get_by_role("tab", name="Vehicles").focus()
     page.keyboard.press("ArrowRight")
@@ -255,6 +304,7 @@ def test_a_submap_is_withdrawn_restored_and_pins_the_frame(deciding, size):
     with deciding(size) as (page, source):
         tab(page, "Submaps")
         card = page.locator(".card", has_text="auv_2/0")
+        card.locator("summary").first.click()
         card.get_by_role("button", name="withdraw", exact=True).click()
         card.locator(".chip", has_text="withdrawn").wait_for()
         card.get_by_role("button", name="restore", exact=True).click()
@@ -337,6 +387,7 @@ def test_a_fix_is_placed_and_the_map_lies_on_earth(deciding, size):
     with deciding(size) as (page, _):
         tab(page, "Submaps")
         card = page.locator(".card", has_text="auv_1/0")
+        card.locator("summary").first.click()
         card.get_by_text("fix this place on earth").click()
         for name, value in (
             ("coordinates", "EPSG:32632"), ("x [m]", "512345"), ("y [m]", "5912345"),

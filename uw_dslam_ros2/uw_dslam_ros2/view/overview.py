@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,6 +27,7 @@ __all__ = [
     "Names",
     "constraint_row",
     "decision_row",
+    "look_of",
     "outline_of",
     "registration_row",
     "submap_row",
@@ -172,12 +174,21 @@ def registration_row(
         "is_used": is_used,
         "probability": _number(answer.probability),
         "pose": None if motion is None else _rounded(motion.as_array(), 4),
+        "look": look_of(answer),
         "sigma": [_number(value) for value in sigma],
         "numbers": {name: _number(value) for name, value in sorted(numbers.items())},
         "submaps": sorted(
             {names.submap(i) for i in (*answer.query.source.ids, *answer.query.target.ids)}
         ),
     }
+
+
+def look_of(answer: Answer) -> str | None:
+    """Name of what both maps look like as an answer lays them; None where it has no pose."""
+    if answer.T_target_source is None:
+        return None
+    told = repr((answer.query.key, answer.T_target_source)).encode()
+    return hashlib.blake2b(told, digest_size=8).hexdigest()
 
 
 def decision_row(

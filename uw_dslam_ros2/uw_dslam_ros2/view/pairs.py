@@ -64,7 +64,7 @@ class Pair:
     def picture(self, layer: str, max_side: int | None = None) -> bytes:
         """PNG of one layer, north up; see `PAIR_LAYERS`.
 
-        With `max_side` that of agreement has no more pixels a side: walls outlast what is smaller.
+        With `max_side` that of agreement has no more pixels a side: walls outlast the rest.
         """
         if layer != "agreement":
             return map_picture(self.target if layer == "target" else self.source, layer)

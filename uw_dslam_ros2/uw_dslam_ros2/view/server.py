@@ -20,6 +20,7 @@ from uw_dslam_ros2.io.decisions import decision_from_plain
 from uw_dslam_ros2.view.export import export_zip
 from uw_dslam_ros2.view.guard import HEADERS, Guard
 from uw_dslam_ros2.view.laying import lay_out, run_map
+from uw_dslam_ros2.view.overview import look_of
 from uw_dslam_ros2.view.pace import Pace
 from uw_dslam_ros2.view.pairs import PAIR_LAYERS, Pair
 from uw_dslam_ros2.view.source import Source
@@ -28,6 +29,8 @@ __all__ = ["ViewServer"]
 
 _MAX_ZOOM, _MIN_ZOOM = 10, -8
 _MAX_PAIRS = 8
+_MAX_SIDE, _SMALL_SIDE = 4000, 300  # pixels of a pair's picture
+_KEPT = {"Cache-Control": "private, max-age=3600, immutable"}
 _MAX_BODY_BYTES = 10_000
 _SHARE = 0.2
 """Of a core, that pages which follow changes may cost: they are told of them less often."""
@@ -51,7 +54,12 @@ class ViewServer:
     ) -> None:
         self._source, self._address, self._port = source, address, port
         self._guard = Guard(address, token)
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="view")
+        # What draws the map is one thread's; a look into a pair must not keep it, nor small
+        # pictures a large one.
+        self._map, self._looks, self._small = (
+            ThreadPoolExecutor(1, thread_name_prefix=f"view {name}")
+            for name in ("map", "looks", "small")
+        )
         self._changed = asyncio.Condition()
         self._runner: web.AppRunner | None = None
         self._pairs: dict[tuple[str, int, int | None], Pair] = {}
@@ -91,6 +99,8 @@ class ViewServer:
             raise InvalidInputError(
                 f"cannot listen on {self._address} port {self._port}: {error.strerror}"
             ) from error
+        # Drawn while the first page comes.
+        self._map.submit(lambda: self._source.showing().tile(None, 0, 0, 0))
         port = self._runner.addresses[0][1]
         host = f"[{self._address}]" if ":" in self._address else self._address
         query = f"/?token={self._guard.token}" if self._guard.token else "/"
@@ -120,7 +130,8 @@ class ViewServer:
             self._changed.notify_all()
         if self._runner is not None:
             await self._runner.cleanup()
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        for pool in (self._map, self._looks, self._small):
+            pool.shutdown(wait=False, cancel_futures=True)
 
     @web.middleware
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -197,11 +208,15 @@ class ViewServer:
         def work() -> dict[str, Any]:
             return lay_out(self._source.showing(), query["source"], query["target"], number)
 
-        return web.json_response(await self._in_thread(work))
+        return web.json_response(await self._in_thread(work, self._looks))
 
     async def _lay_picture(self, request: web.Request) -> web.StreamResponse:
         name, layer = request.query["run"], request.query["layer"]
-        body = await self._in_thread(lambda: run_map(self._source.showing(), name).picture(layer))
+
+        def work() -> bytes:
+            return run_map(self._source.showing(), name).picture(layer)
+
+        body = await self._in_thread(work, self._looks)
         return web.Response(body=body, content_type="image/png")
 
     async def _decide(self, request: web.Request) -> web.StreamResponse:
@@ -234,14 +249,13 @@ class ViewServer:
 
         body = await self._in_thread(work)
         # The address names the version, so what it holds never changes.
-        headers = {"Cache-Control": "private, max-age=3600, immutable"}
         if body is None:
-            return web.Response(status=204, headers=headers)
-        return web.Response(body=body, content_type="image/png", headers=headers)
+            return web.Response(status=204, headers=_KEPT)
+        return web.Response(body=body, content_type="image/png", headers=_KEPT)
 
     async def _pair(self, request: web.Request) -> web.StreamResponse:
         number, rival = _pair_of(request)
-        pair = await self._in_thread(lambda: self._pair_at(number, rival))
+        pair = await self._in_thread(lambda: self._pair_at(number, rival), self._looks)
         spec = pair.spec
         return web.json_response(
             {
@@ -257,8 +271,22 @@ class ViewServer:
         layer = request.match_info["layer"]
         if layer not in PAIR_LAYERS:
             raise InvalidInputError(f"layer is {layer!r}, expected one of {PAIR_LAYERS}")
-        body = await self._in_thread(lambda: self._pair_at(number, rival).picture(layer))
-        return web.Response(body=body, content_type="image/png")
+        side = int(request.query.get("side", _MAX_SIDE))
+        if not 1 <= side <= _MAX_SIDE:
+            raise InvalidInputError(f"side is {side}, expected 1 to {_MAX_SIDE} pixels")
+
+        is_small = side < _SMALL_SIDE
+
+        def work() -> tuple[bytes, str | None]:
+            showing = self._source.showing()
+            # A list asks for many, once each.
+            pair = showing.pair(number, rival) if is_small else self._pair_at(number, rival)
+            return pair.picture(layer, side), look_of(showing.answer(number))
+
+        body, look = await self._in_thread(work, self._small if is_small else self._looks)
+        # Numbers of registrations may change; what is asked for by its look does not.
+        is_kept = look is not None and request.query.get("look") == look
+        return web.Response(body=body, content_type="image/png", headers=_KEPT if is_kept else {})
 
     async def _rivals(self, request: web.Request) -> web.StreamResponse:
         number, _ = _pair_of(request)
@@ -273,7 +301,7 @@ class ViewServer:
                 for rival in result.rivals
             ]
 
-        return web.json_response(await self._in_thread(work))
+        return web.json_response(await self._in_thread(work, self._looks))
 
     def _pair_at(self, number: int, rival: int | None) -> Pair:
         showing = self._source.showing()
@@ -284,8 +312,10 @@ class ViewServer:
             self._pairs[key] = showing.pair(number, rival)
         return self._pairs[key]
 
-    async def _in_thread(self, work: Callable[[], Any]) -> Any:
-        """One at a time, beside the loop, which goes on answering."""
+    async def _in_thread(
+        self, work: Callable[[], Any], pool: ThreadPoolExecutor | None = None
+    ) -> Any:
+        """One at a time, beside the loop, which goes on answering; by default that of the map."""
 
         def timed() -> Any:
             begun_s = time.thread_time()
@@ -294,7 +324,7 @@ class ViewServer:
             finally:
                 self._pace.spend(time.thread_time() - begun_s)
 
-        return await asyncio.get_running_loop().run_in_executor(self._pool, timed)
+        return await asyncio.get_running_loop().run_in_executor(pool or self._map, timed)
 
 
 def _call_in(

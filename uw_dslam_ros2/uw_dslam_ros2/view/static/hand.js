@@ -44,8 +44,8 @@ export class Hand {
       return false;
     }
     try {
-      const { number } = await tell("/api/decide", { ...decision, who: this.who.value.trim() });
-      this.tell(`Decision ${number} is noted.`);
+      const taken = await tell("/api/decide", { ...decision, who: this.who.value.trim() });
+      this.tell(`Decision ${taken.number} is noted.`);
       return true;
     } catch (error) {
       this.tell(error.message, true);

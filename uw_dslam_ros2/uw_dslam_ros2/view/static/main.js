@@ -4,8 +4,10 @@ import { LayDialog } from "./lay.js";
 import { MapView } from "./map.js";
 import { PairDialog } from "./pair.js";
 import { Panel } from "./panel.js";
+import { Replay } from "./replay.js";
 
 const at = (id) => document.getElementById(id);
+const STATUS_MS = 2000;
 let scene = null;
 let isBusy = false;
 let isStale = false;
@@ -15,12 +17,9 @@ const laying = new LayDialog(hand);
 const lay = (runs, match) => laying.open(scene.vehicles.map((vehicle) => vehicle.name), runs, match);
 const dialog = new PairDialog(hand, lay);
 const panel = new Panel(at("tabs"), at("content"), {
-  toggle: (name, isOn) => map.toggle(name, isOn),
   zoom: (name) => {
     const points = scene.vehicles.find((v) => v.name === name).track.flatMap((piece) => piece.xy);
-    const xs = points.map((p) => p[0]);
-    const ys = points.map((p) => p[1]);
-    if (points.length) map.fit([[Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)]]);
+    if (points.length) map.fit(points);
   },
   pair: (row) => {
     map.highlight(scene.constraints.filter((edge) => belongs(edge, row)).map((edge) => edge.line));
@@ -29,6 +28,7 @@ const panel = new Panel(at("tabs"), at("content"), {
   lay: () => lay(),
 }, hand);
 const map = new MapView("map", select, async (x, y) => panel.showCell(await map.cell(x, y)));
+const replay = new Replay(at("play"), at("moment"), draw);
 
 function belongs(edge, row) {
   return edge.kind === "registration" && row.submaps.includes(edge.source) && row.submaps.includes(edge.target);
@@ -57,11 +57,10 @@ function select(kind, which) {
 }
 
 function draw() {
-  const slider = at("moment");
-  const moment = Number(slider.value);
-  const newest = moment > 0 ? scene.moments[moment - 1] : null;
-  at("moment-text").textContent = newest ? `${clock(newest.stamp_s)}  ${moment} of ${scene.moments.length} submaps` : "before the first submap";
-  map.show(scene, moment);
+  if (!scene) return;
+  const newest = replay.moment > 0 ? scene.moments[replay.moment - 1] : null;
+  at("moment-text").textContent = newest ? `${clock(newest.stamp_s)} · ${replay.moment} of ${scene.moments.length} submaps` : "before the first submap";
+  map.show(scene, replay.moment);
 }
 
 async function refresh() {
@@ -71,13 +70,10 @@ async function refresh() {
   }
   isBusy = true;
   try {
-    const slider = at("moment");
-    const wasNewest = slider.value === slider.max;
     const [next, status] = await Promise.all([ask("/api/scene"), ask("/api/status")]);
     scene = next;
     panel.status = status;
-    slider.max = String(scene.moments.length);
-    if (wasNewest) slider.value = slider.max;
+    replay.resize(scene.moments.length);
     at("title").textContent = scene.title;
     document.title = `${scene.title} – uw_dslam`;
     const merged = scene.vehicles.filter((vehicle) => vehicle.num_merged > 0).length;
@@ -96,13 +92,12 @@ async function refresh() {
   }
 }
 
-// What nodes tell of themselves changes without the map changing.
+// Ages, and what nodes tell of themselves, change without the map changing.
 setInterval(async () => {
-  if (panel.current !== "health" || !panel.status.is_live) return;
+  if (!scene || !panel.status.is_live || !panel.showsStatus) return;
   panel.status = await ask("/api/status").catch(() => panel.status);
   panel.show(scene);
-}, 2000);
-at("moment").oninput = () => scene && draw();
+}, STATUS_MS);
 listen(refresh, (isThere) => {
   at("connection").textContent = isThere ? "" : "the view is not there: what is shown may be old";
 });

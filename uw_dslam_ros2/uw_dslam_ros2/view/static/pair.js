@@ -17,12 +17,12 @@ export class PairDialog {
     at("pair-slider").oninput = () => this.#clip();
     for (const [mode, name] of Object.entries(MODES)) {
       const choice = element("input", { type: "radio", name: "pair-mode", value: mode, checked: mode === "agreement", onchange: () => this.#draw() });
-      at("pair-modes").append(element("label", {}, choice, ` ${name} `));
+      at("pair-modes").append(element("label", {}, choice, ` ${name}`));
     }
     for (const [colour, name] of LEGEND) {
       const swatch = element("span", { className: "swatch" });
       swatch.style.background = colour;
-      at("pair-legend").append(element("span", {}, swatch, `${name}   `));
+      at("pair-legend").append(element("span", {}, swatch, name));
     }
   }
 
@@ -36,11 +36,11 @@ export class PairDialog {
     const chip = element("span", { className: `chip ${row.verdict === "ACCEPTED" ? "good" : ""}` }, row.verdict);
     at("pair-verdict").replaceChildren(chip, ` ${row.reason}`);
     const [x, y, yaw] = row.pose || [];
-    const rows = row.pose ? [["pose of the source in the target", `x ${x.toFixed(2)} m, y ${y.toFixed(2)} m, ${(yaw * 180 / Math.PI).toFixed(2)}°`],
-      ["standard deviations", `${show(row.sigma[0])} m, ${show(row.sigma[1])} m, ${show(row.sigma[2] * 180 / Math.PI)}°`]] : [];
+    const rows = row.pose ? [["source in target", `x ${x.toFixed(2)} m, y ${y.toFixed(2)} m, ${(yaw * 180 / Math.PI).toFixed(2)}°`],
+      ["standard deviations", `${show(row.sigma[0], 2)} m, ${show(row.sigma[1], 2)} m, ${show(row.sigma[2] * 180 / Math.PI, 2)}°`]] : [];
     rows.push(["probability that it is right", show(row.probability)]);
-    for (const [name, value] of Object.entries(row.numbers)) rows.push([name.replaceAll("_", " "), show(value)]);
-    at("pair-numbers").replaceChildren(...rows.map(([name, value]) => element("tr", {}, element("th", { scope: "row" }, name), element("td", {}, String(value)))));
+    at("pair-pose").replaceChildren(...rows.map(line));
+    at("pair-numbers").replaceChildren(...Object.entries(row.numbers).map(([name, value]) => line([name.replaceAll("_", " "), show(value)])));
     at("pair-rivals").replaceChildren();
     this.#hand();
     if (!at("pair").open) {
@@ -48,10 +48,10 @@ export class PairDialog {
       at("pair").showModal();
     }
     if (!row.pose) {
-      at("pair-stage").replaceChildren("There is no pose to draw.");
+      at("pair-stage").replaceChildren(element("p", { className: "empty" }, "There is no pose to draw."));
       return;
     }
-    const look = element("button", { onclick: () => this.#rivals(look) }, "look for rivals");
+    const look = element("button", { type: "button", className: "tool", onclick: () => this.#rivals(look) }, "look for rivals");
     at("pair-rivals").replaceChildren(look);
     this.#draw();
   }
@@ -100,10 +100,10 @@ export class PairDialog {
         for (const other of at("pair-rivals").children) other.setAttribute("aria-pressed", String(other === made));
         this.#draw();
       };
-      const own = attributes(element("button", { onclick: () => choose(null, own) }, "the answer"), { "aria-pressed": "true" });
+      const own = attributes(element("button", { type: "button", className: "tool", onclick: () => choose(null, own) }, "the answer"), { "aria-pressed": "true" });
       const others = rivals.map((rival, index) => {
         const [x, y, yaw] = rival.pose;
-        const made = element("button", { onclick: () => choose(index, made) }, `x ${x.toFixed(1)} m, y ${y.toFixed(1)} m, ${(yaw * 180 / Math.PI).toFixed(0)}°: ${(100 * rival.score_share).toFixed(0)} % of the score`);
+        const made = element("button", { type: "button", className: "tool", onclick: () => choose(index, made) }, `x ${x.toFixed(1)} m, y ${y.toFixed(1)} m, ${(yaw * 180 / Math.PI).toFixed(0)}°: ${(100 * rival.score_share).toFixed(0)} % of the score`);
         return attributes(made, { "aria-pressed": "false" });
       });
       at("pair-rivals").replaceChildren(own, ...others, others.length ? "" : "There are no rivals.");
@@ -123,19 +123,27 @@ export class PairDialog {
       onerror: () => at("pair-stage").replaceChildren("This pair cannot be drawn any more."),
     })));
     if (mode === "both") at("pair-stage").lastChild.style.mixBlendMode = "multiply";
-    if (mode === "slide") this.#clip();
+    if (mode === "slide") {
+      at("pair-stage").append(element("div", { className: "cut" }));
+      this.#clip();
+    }
   }
 
   #clip() {
-    const source = at("pair-stage").lastChild;
-    if (!(source instanceof HTMLImageElement)) return;
+    const [source, cut] = [at("pair-stage").querySelectorAll("img")[1], at("pair-stage").querySelector(".cut")];
+    if (!source || !cut) return;
     const share = Number(at("pair-slider").value);
     source.style.clipPath = `inset(0 0 0 ${100 - share}%)`;
-    source.style.background = "#cfd8df";
+    source.style.background = "var(--water)";
+    cut.style.left = `${100 - share}%`;
   }
 }
 
-function show(value) {
+function line([name, value]) {
+  return element("tr", {}, element("th", { scope: "row" }, name), element("td", {}, String(value)));
+}
+
+function show(value, digits = 4) {
   if (value === null || value === undefined || Number.isNaN(value)) return "not known";
-  return Math.abs(value) >= 1000 || Number.isInteger(value) ? String(value) : Number(value).toPrecision(4);
+  return Math.abs(value) >= 1000 || Number.isInteger(value) ? String(value) : Number(value).toPrecision(digits);
 }

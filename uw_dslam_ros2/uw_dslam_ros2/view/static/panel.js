@@ -1,10 +1,11 @@
 // The lists beside the map.
 import { attributes, clock, day, element, style_of } from "./api.js";
+import { told } from "./edges.js";
 import { worded } from "./hand.js";
-import { told } from "./map.js";
 
 const TABS = { vehicles: "Vehicles", matches: "Matches", submaps: "Submaps", cell: "Cell", decisions: "Decisions", health: "Health" };
-const LAYERS = { tracks: "tracks", submaps: "submaps", constraints: "matches", odometry: "odometry" };
+const OF_STATUS = ["vehicles", "health"];
+const OLD_S = 5;
 
 export class Panel {
   constructor(tabs, content, actions, hand) {
@@ -16,7 +17,6 @@ export class Panel {
     this.found = null;
     this.status = {};
     this.opened = new Set();
-    this.layers = { tracks: true, submaps: false, constraints: true, odometry: false };
     const names = Object.keys(TABS);
     for (const name of names) {
       const tab = element("button", { id: `tab-${name}`, type: "button", onclick: () => this.open(name) }, TABS[name]);
@@ -28,8 +28,14 @@ export class Panel {
     }
   }
 
+  /** Whether what is open shows what changes without the map changing. */
+  get showsStatus() {
+    return OF_STATUS.includes(this.current);
+  }
+
   show(scene) {
     this.scene = scene;
+    this.colours = new Map(scene.vehicles.map((vehicle, index) => [vehicle.name, style_of(index).color]));
     // What somebody is writing is not taken away.
     if (!this.content.querySelector("details.form[open]")) this.open(this.current);
   }
@@ -42,7 +48,11 @@ export class Panel {
       if (isOn && isFocused) tab.focus();
     }
     if (!this.scene) return;
+    const held = path_to(document.activeElement, this.content);
     this.content.replaceChildren(...this[`_${name}`]());
+    // Who uses the keys stays where they were.
+    const again = held && at_path(held, this.content);
+    if (again) again.focus({ preventScroll: true });
   }
 
   showCell(cell) {
@@ -52,65 +62,83 @@ export class Panel {
   }
 
   showSubmap(name) {
+    this.opened.add(`submap ${name}`);
     this.open("submaps");
-    const card = this.content.querySelector(`[data-name="${CSS.escape(name)}"]`);
-    if (card) card.scrollIntoView({ block: "center" });
+    this.#reveal(`[data-name="${CSS.escape(name)}"]`);
   }
 
   showDecision(number) {
     this.open("decisions");
-    const card = this.content.querySelector(`[data-number="${number}"]`);
+    this.#reveal(`[data-number="${number}"]`);
+  }
+
+  #reveal(selector) {
+    const card = this.content.querySelector(selector);
     if (card) card.scrollIntoView({ block: "center" });
   }
 
+  #swatch(name) {
+    const swatch = element("span", { className: "swatch" });
+    swatch.style.background = this.colours.get(name);
+    return swatch;
+  }
+
+  /** A card that opens, and stays open when what it shows changes. */
+  #folded(key, summary, ...inner) {
+    return element("details", { className: "card", open: this.opened.has(key), ontoggle: (event) => this.opened[event.target.open ? "add" : "delete"](key) },
+      element("summary", {}, ...summary), ...inner);
+  }
+
   _vehicles() {
-    const choices = Object.entries(LAYERS).map(([name, label]) => {
-      const box = element("input", { type: "checkbox", checked: this.layers[name], onchange: () => { this.layers[name] = box.checked; this.actions.toggle(name, box.checked); } });
-      return element("label", {}, box, ` ${label}`);
-    });
-    const cards = this.scene.vehicles.map((vehicle, index) => {
-      const swatch = element("span", { className: "swatch" });
-      swatch.style.background = style_of(index).color;
-      const isMerged = vehicle.num_merged > 0;
+    const notes = (this.status.notes || []).map((note) => element("p", { className: "card note" }, note));
+    const cards = this.scene.vehicles.map((vehicle) => {
       const age = (this.status.ages || {})[vehicle.name];
       const isOut = vehicle.num_withdrawn === vehicle.num_submaps;
-      const run = { source: vehicle.id, is_run: true };
-      const tools = element("div", { className: "tools" }, this.hand.button(isOut ? "restore the run" : "withdraw the run", { kind: isOut ? "restore" : "withdraw", ...run }));
-      const card = element("button", { className: "card", onclick: () => this.actions.zoom(vehicle.name) },
-        swatch, element("b", {}, vehicle.name), " ",
-        element("span", { className: `chip ${isMerged ? "good" : ""}` }, isMerged ? "merged" : "by itself"),
+      const name = element("button", { type: "button", className: "link", title: "show it on the map", onclick: () => this.actions.zoom(vehicle.name) }, vehicle.name);
+      const state = chip(isOut ? "withdrawn" : vehicle.num_merged > 0 ? "merged" : "by itself", vehicle.num_merged > 0 ? "good" : isOut ? "off" : "");
+      const said = this.hand.button(isOut ? "restore the run" : "withdraw the run", { kind: isOut ? "restore" : "withdraw", source: vehicle.id, is_run: true });
+      return element("div", { className: "card" },
+        element("div", { className: "row" }, this.#swatch(vehicle.name), name, state),
         element("small", {}, `${vehicle.num_merged} of ${vehicle.num_submaps} submaps in the map${age === undefined ? "" : `, last message ${age.toFixed(0)} s ago`}`),
-        element("small", {}, vehicle.reason));
-      return element("div", {}, card, tools);
+        element("small", {}, vehicle.reason),
+        element("div", { className: "tools" }, said));
     });
-    const notes = (this.status.notes || []).map((note) => element("p", { className: "card" }, note));
-    return [element("fieldset", {}, ...choices), ...cards, ...notes];
+    return [...notes, ...(cards.length ? cards : [empty("No submap has come yet.")])];
   }
 
   _matches() {
-    const edges = this.scene.constraints.filter((edge) => edge.kind === "registration");
     const rows = [...this.scene.registrations].sort((a, b) => Number(b.is_used) - Number(a.is_used) || b.probability - a.probability);
-    const cards = rows.map((row) => element("button", { className: "card", onclick: () => this.actions.pair(row) },
-      element("b", {}, `${row.source} in ${row.target}`), " ",
-      element("span", { className: `chip ${row.is_used ? "good" : row.verdict === "ACCEPTED" ? "" : "off"}` }, row.is_used ? "holds" : row.verdict === "ACCEPTED" ? "taken out" : row.verdict),
-      element("small", {}, row.reason)));
-    const left = edges.map((edge) => element("p", { className: "card" }, told(edge)));
-    return cards.length ? cards : left.length ? left : ["Nothing has been registered yet."];
+    if (!rows.length) {
+      const edges = this.scene.constraints.filter((edge) => edge.kind === "registration");
+      return edges.length ? edges.map((edge) => element("p", { className: "card" }, told(edge))) : [empty("Nothing has been registered yet.")];
+    }
+    const holding = rows.filter((row) => row.is_used).length;
+    const cards = rows.map((row) => {
+      const state = row.is_used ? chip("holds", "good") : row.verdict === "ACCEPTED" ? chip("taken out") : chip(row.verdict, "off");
+      const picture = row.look && element("img", { loading: "lazy", alt: "", src: `/api/pairs/${row.number}/agreement.png?side=136&look=${row.look}` });
+      return element("button", { type: "button", className: "card match", onclick: () => this.actions.pair(row) }, picture,
+        element("span", {},
+          element("span", { className: "row" }, element("b", {}, this.#swatch(row.runs[0]), ` ${row.source} in `, this.#swatch(row.runs[1]), ` ${row.target}`), state),
+          element("small", {}, row.reason)));
+    });
+    return [element("p", { className: "soft" }, `${holding} of ${rows.length} registrations hold; a click shows why`), ...cards];
   }
 
   _submaps() {
-    return this.scene.submaps.map((submap) => {
-      const card = element("div", { className: "card" }, element("b", {}, submap.name), " ",
-        element("span", { className: `chip ${submap.state === "merged" ? "good" : "off"}` }, submap.state),
-        element("small", {}, `revision ${submap.revision}, ${submap.is_final ? "closed" : "still growing"}, ${clock(submap.stamp_s)}`),
-        element("small", {}, submap.reason));
+    const cards = this.scene.submaps.map((submap) => {
       const isOut = submap.state === "withdrawn";
       const switched = this.hand.button(isOut ? "restore" : "withdraw", { kind: isOut ? "restore" : "withdraw", source: submap.id });
       const pin = this.hand.button("pin the frame here", { kind: "pin", source: submap.id });
-      card.append(element("div", { className: "tools" }, switched, ...(isOut ? [] : [pin])), ...(isOut ? [] : [this.hand.fixForm(submap.id, [0, 0])]));
+      const card = this.#folded(`submap ${submap.name}`,
+        [element("span", { className: "row" }, this.#swatch(submap.vehicle), element("b", {}, submap.name), element("small", {}, clock(submap.stamp_s)), chip(submap.state, submap.state === "merged" ? "good" : "off"))],
+        element("small", {}, `revision ${submap.revision}, ${submap.is_final ? "closed" : "still growing"}`),
+        element("small", {}, submap.reason),
+        element("div", { className: "tools" }, switched, ...(isOut ? [] : [pin])),
+        ...(isOut ? [] : [this.hand.fixForm(submap.id, [0, 0])]));
       card.dataset.name = submap.name;
       return card;
     });
+    return cards.length ? cards : [empty("No submap has come yet.")];
   }
 
   _decisions() {
@@ -125,30 +153,54 @@ export class Panel {
       card.dataset.number = row.number;
       return card;
     });
-    return [element("div", { className: "tools" }, lay), ...(earth ? [earth] : []), ...(cards.length ? cards : ["Nobody has decided anything yet."])];
+    const none = empty("Nobody has decided anything yet. Matches, submaps and vehicles have buttons for it; each decision is listed here and can be undone.");
+    return [element("div", { className: "tools" }, lay), ...(earth ? [earth] : []), ...(cards.length ? cards : [none])];
   }
 
   _health() {
     const rows = this.status.diagnostics || [];
-    if (!rows.length) return [this.status.is_live ? "No node has told of itself yet." : "This is a saved merge: no node runs."];
+    if (!rows.length) return [empty(this.status.is_live ? "No node has told of itself yet." : "This is a saved merge: no node runs.")];
     const links = rows.filter((row) => row.sent_bytes !== undefined);
     const sent = links.map((row) => element("tr", {}, element("td", {}, row.name.split(":")[0]), element("td", {}, `${row.sent_bytes} bytes`), element("td", {}, row.bits_per_s === null ? "" : `${row.bits_per_s.toFixed(0)} bit/s`)));
-    const cards = rows.map((row) => element("details", { className: "card", open: this.opened.has(row.name), ontoggle: (event) => this.opened[event.target.open ? "add" : "delete"](row.name) },
-      element("summary", {}, element("b", {}, row.name.split(":")[0]), " ", element("span", { className: `chip ${row.level === "ok" ? "good" : ""}` }, row.level),
-        element("small", {}, `${row.message}${row.age_s > 5 ? `, ${row.age_s.toFixed(0)} s ago` : ""}`)),
+    const cards = rows.map((row) => this.#folded(row.name,
+      [element("span", { className: "row" }, element("b", {}, row.name.split(":")[0]), chip(row.level, row.level === "ok" ? "good" : "")),
+        element("small", {}, `${row.message}${row.age_s > OLD_S ? `, ${row.age_s.toFixed(0)} s ago` : ""}`)],
       element("table", {}, ...Object.entries(row.values).map(([key, value]) => element("tr", {}, element("th", { scope: "row" }, key), element("td", {}, value))))));
     return [...(links.length ? [element("h3", {}, "sent over the acoustic link"), element("table", {}, ...sent)] : []), ...cards];
   }
 
   _cell() {
-    if (this.wasAsked && !this.found) return ["Nothing was seen here."];
-    if (!this.found) return ["Click on the map to see which submaps saw a cell, and what they say of it."];
-    const rows = Object.entries(this.found.percent).map(([name, percent]) => element("tr", {}, element("td", {}, name), element("td", {}, `${percent} %`), element("td", {}, percent > 50 ? "wall" : "free")));
+    if (this.wasAsked && !this.found) return [empty("Nothing was seen here.")];
+    if (!this.found) return [empty("Click on the map, or press Enter on it, to see which submaps saw a cell and what they say of it.")];
+    const owners = new Map(this.scene.submaps.map((submap) => [submap.name, submap.vehicle]));
+    const rows = Object.entries(this.found.percent).map(([name, percent]) => element("tr", {}, element("td", {}, this.#swatch(owners.get(name)), ` ${name}`), element("td", {}, `${percent} %`), element("td", {}, percent > 50 ? "wall" : "free")));
     return [
-      element("p", {}, `x ${this.found.x_m} m, y ${this.found.y_m} m`),
+      element("p", {}, element("b", {}, `x ${this.found.x_m} m, y ${this.found.y_m} m`)),
       element("p", {}, `${this.found.num_occupied} submaps say wall, ${this.found.num_free} say free`),
       element("table", {}, ...rows),
       this.hand.fixForm(...Object.values(this.found.points)[0]),
     ];
   }
+}
+
+function chip(words, kind = "") {
+  return element("span", { className: `chip ${kind}` }, words);
+}
+
+function empty(words) {
+  return element("p", { className: "empty" }, words);
+}
+
+/** Which child of which child an element is; null outside `root`. */
+function path_to(child, root) {
+  const path = [];
+  for (let one = child; one !== root; one = one.parentElement) {
+    if (!one || !one.parentElement) return null;
+    path.unshift([...one.parentElement.children].indexOf(one));
+  }
+  return path.length ? path : null;
+}
+
+function at_path(path, root) {
+  return path.reduce((one, index) => one && one.children[index], root);
 }
