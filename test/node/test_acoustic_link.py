@@ -15,6 +15,7 @@ from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.core.link import Layer
 from uw_dslam_ros2.core.link.transport.packets import Packet
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.link_state import load_link_state
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_to_msg
 from uw_dslam_ros2.ros.nodes.acoustic_link import AcousticLinkNode
@@ -98,6 +99,24 @@ def test_each_vehicle_gets_the_others_submaps_and_its_own_as_they_have_it(fleet,
         np.testing.assert_array_equal(mine.grid.values, theirs.grid.values)
         assert mine.T_odom_submap == theirs.T_odom_submap
         assert mine.grid.spec.resolution_m == pytest.approx(0.1)
+
+
+def test_a_submap_that_is_drawn_anew_moves_and_is_not_sent_once_more(fleet):
+    with fleet() as (until, send, got):
+        send(room_submap("auv_1", 0))
+        until(lambda: all(k and k["auv_1", 0].revision == Layer.FINE for k in got.values()))
+        first = fleet.links[0]._link.own_submap(SubmapId("auv_1", 0, 0))
+        send(
+            room_submap(
+                "auv_1",
+                revision=1,
+                T_room_submap=SE2(0.3, 0.0, 0.0),
+                T_odom_submap=SE2(1.0, 0.5, 0.0),
+            )
+        )
+        until(lambda: got[2]["auv_1", 0].T_odom_submap.x == pytest.approx(1.0, abs=0.01))
+        again = fleet.links[0]._link.own_submap(SubmapId("auv_1", 0, 0))
+    np.testing.assert_array_equal(again.grid.values, first.grid.values)
 
 
 def test_nothing_arrives_in_a_blackout_and_all_of_it_afterwards(fleet):

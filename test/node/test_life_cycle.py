@@ -261,7 +261,7 @@ def test_a_mapper_maps_anew_after_a_clean_up(ros_context, spinning):
         drive(until, vehicle, range(3, 7))
         until(lambda: vehicle.values().get("num_scan") == "8", "all scans")
         assert "8 pings mapped into 1 submaps" in finish(until, vehicle).message
-        until(lambda: len(vehicle.submaps) == 2, "the submap")
+        until(lambda: len(vehicle.submaps) == 3, "the submap, and drawn anew")
         assert len({msg.run_id for msg in vehicle.submaps}) == 2
 
 
@@ -299,9 +299,9 @@ def test_a_mapper_that_is_reset_begins_a_new_run(ros_context, spinning):
         drive(until, vehicle, range(4, 8))
         until(lambda: vehicle.values().get("num_scan") == "16", "all scans")
         finish(until, vehicle)
-        until(lambda: len(vehicle.submaps) == 2, "the new run's submap")
+        until(lambda: len(vehicle.submaps) == 4, "the new run's submap, and both drawn anew")
         assert len({msg.run_id for msg in vehicle.submaps}) == 2
-        assert [msg.sequence for msg in vehicle.submaps] == [0, 0]
+        assert [msg.sequence for msg in vehicle.submaps] == [0, 0, 0, 0]
         until(lambda: vehicle.odometry[-1].pose.pose.position.x > 3.5, "odometry that goes on")
 
 

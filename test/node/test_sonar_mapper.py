@@ -36,7 +36,8 @@ def test_room_becomes_map_submap_odometry_and_frames(ros_context, spinning):
         response = finish(until, vehicle)
         assert response.success
         assert "20 pings mapped into 1 submaps; 0 bad" in response.message
-        until(lambda: vehicle.submaps and vehicle.maps and vehicle.paths, "results")
+        assert "1 submaps drawn anew" in response.message
+        until(lambda: len(vehicle.submaps) == 2 and vehicle.maps and vehicle.paths, "results")
         until(lambda: ("auv_1/odom", "auv_1/base_link") in vehicle.frames, "TF")
         last_ns = START_NS + 9_900_000_000
         until(lambda: stamp_of(vehicle.odometry[-1]) == last_ns, "the last odometry")
@@ -51,7 +52,8 @@ def test_room_becomes_map_submap_odometry_and_frames(ros_context, spinning):
     assert (again.result, again.submap) == (GetSubmap.Response.DONE, vehicle.submaps[-1])
     assert unknown.result == GetSubmap.Response.NOT_FOUND
     assert "no submap 1" in unknown.message
-    submap = submap_from_msg(vehicle.submaps[-1])
+    assert [msg.revision for msg in vehicle.submaps] == [0, 1]
+    submap = submap_from_msg(vehicle.submaps[-1])  # drawn anew, and so whole
     assert (submap.vehicle_id, submap.sequence) == ("auv_1", 0)
     assert submap.run_id > 0
     assert submap.is_final
@@ -202,14 +204,14 @@ def test_recording_that_begins_again_begins_a_new_run_and_keeps_the_old_one(ros_
         drive(until, vehicle, range(4))
         until(lambda: int(vehicle.values().get("num_restarts", "0")) >= 1, "the restart")
         response = finish(until, vehicle)
-        until(lambda: len(vehicle.submaps) == 2, "a submap of each run")
+        until(lambda: len(vehicle.submaps) == 4, "a submap of each run, and both drawn anew")
         # Odometry goes on; only its frame is elsewhere in the map of the new run.
         way_m = SPEED_M_S * (7.9 + 3.9)
         until(
             lambda: abs(vehicle.odometry[-1].pose.pose.position.x - way_m) < 0.1, "odometry's end"
         )
     assert "24 pings mapped" in response.message
-    first, second = (submap_from_msg(msg) for msg in vehicle.submaps)
+    first, second = (submap_from_msg(msg) for msg in vehicle.submaps[2:])
     assert first.run_id != second.run_id
     assert (len(first.trajectory), len(second.trajectory)) == (16, 8)
 

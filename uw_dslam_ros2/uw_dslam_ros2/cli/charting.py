@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -13,13 +11,14 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.cli.outcome import Outcome, VehicleOutcome
 from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart, refined
 from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.chart.redraw import drift_of, moved_by
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.se2 import wrap_angle
-from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
+from uw_dslam_ros2.core.submap import SubmapId, Track
 
 __all__ = ["PingTracks", "chart_tracks", "charted"]
 
@@ -100,23 +99,10 @@ def _tracks_of(records: Sequence[SubmapRecord], pings: Pings) -> PingTracks:
         track: PingTrack(
             kept[track],
             np.array(poses[track]),
-            **_drift([r.submap for r in records if r.submap.submap_id.track == track]),
+            **drift_of([r.submap for r in records if r.submap.submap_id.track == track]),
         )
         for track in kept
     }
-
-
-def _drift(submaps: Sequence[Submap]) -> dict[str, float]:
-    """What navigation says a path gains on one metre, of a run's submaps in their order."""
-    found = []
-    for before, after in itertools.pairwise(submaps):
-        way_m = float(np.hypot(*np.diff(before.trajectory[:, :2], axis=0).T).sum())
-        if after.sequence == before.sequence + 1 and way_m > 0.0:
-            found.append(np.diag(after.covariance) / way_m)
-    if not found:
-        return {}
-    x, y, yaw = np.median(found, axis=0)
-    return {"drift_m": math.sqrt(0.5 * (x + y)), "drift_rad": math.sqrt(yaw)}
 
 
 def _bent(vehicle: VehicleOutcome, before: PingTracks, after: PingTracks) -> VehicleOutcome:
@@ -125,19 +111,6 @@ def _bent(vehicle: VehicleOutcome, before: PingTracks, after: PingTracks) -> Veh
     if vehicle.trajectory is None or not own:
         return vehicle
     stamps_ns, poses = vehicle.trajectory
-    ping_ns = np.concatenate([before[track].stamps_ns for track in own])
-    moved = np.vstack([_moved(before[track], after[track]) for track in own])
-    order = np.argsort(ping_ns, kind="stable")
-    # Relative to the first: nanoseconds since 1970 do not fit a double.
-    start_ns = int(ping_ns.min())
-    at, known = stamps_ns - start_ns, ping_ns[order] - start_ns
-    new = poses + np.column_stack([np.interp(at, known, column) for column in moved[order].T])
+    new = poses + moved_by([before[t] for t in own], [after[t] for t in own], stamps_ns)
     new[:, 2] = wrap_angle(new[:, 2])
     return dataclasses.replace(vehicle, trajectory=(stamps_ns, new))
-
-
-def _moved(before: PingTrack, after: PingTrack) -> FloatArray:
-    """How each pose (K, 3) of the vehicle changes; the sonar's turn on it is no heading."""
-    moved = after.T_map_sonar - before.T_map_sonar
-    moved[:, 2] = wrap_angle(moved[:, 2] - after.mounting_rad)
-    return moved

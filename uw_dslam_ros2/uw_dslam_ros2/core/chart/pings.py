@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from uw_dslam_ros2.core.submap import SubmapId
 __all__ = ["DrawnPing", "KeptPings", "pack_ping"]
 
 Float32Array = NDArray[np.float32]
+_OBJECT_BYTES = 700
+"""Of a ping without its numbers: its own object, its pose, and three arrays' heads."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +35,16 @@ class DrawnPing:
     free_range_m: Float32Array
     beamwidth_rad: float
     range_sigma_m: float
+
+    def num_bytes_after(self, before: DrawnPing | None) -> int:
+        """Memory that it takes, beside the ping before it."""
+        own = (self.points, self.weight, self.free_range_m)
+        has_bearings = before is None or before.bearing_rad is not self.bearing_rad
+        return (
+            _OBJECT_BYTES
+            + sum(array.nbytes for array in own)
+            + has_bearings * self.bearing_rad.nbytes
+        )
 
     def detections(self, range_scale: float = 1.0) -> Detections:
         """In full, with a factor on all ranges."""
@@ -66,13 +79,25 @@ def pack_ping(
 
 
 class KeptPings:
-    """Watches a mapper and keeps what enters its submaps; memory grows with the time."""
+    """Watches a mapper and keeps what enters its submaps.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    max_bytes
+        How much is kept at most; what comes after that is left out, and counted.
+    """
+
+    def __init__(self, max_bytes: float = math.inf) -> None:
         self.of_submap: dict[SubmapId, list[DrawnPing]] = {}
+        self.num_bytes = self.num_left_out = 0
+        self._max_bytes = max_bytes
         self._last: DrawnPing | None = None
 
     def __call__(self, submap_id: SubmapId, detections: Detections, T_submap_sonar: SE2) -> None:
         """Keep one ping."""
-        self._last = pack_ping(detections, T_submap_sonar, self._last)
+        if self.num_bytes >= self._max_bytes:
+            self.num_left_out += 1
+            return
+        last, self._last = self._last, pack_ping(detections, T_submap_sonar, self._last)
+        self.num_bytes += self._last.num_bytes_after(last)
         self.of_submap.setdefault(submap_id, []).append(self._last)

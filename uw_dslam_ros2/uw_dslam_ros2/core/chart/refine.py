@@ -39,8 +39,8 @@ _NOTHING = 1e-6
 _INFORMATION_SHARE = 0.1
 """Neighbouring echoes err together."""
 _ITERATIONS = 10
-_MAX_ECHOES, _FEW_ECHOES = 60, 20
-"""Of one ping; more of the same walls add time, not accuracy."""
+_MAX_ECHOES, _FEW_ECHOES, _MAX_ECHOES_IN_ALL = 60, 20, 600_000
+"""Of one ping, and of a mission of many hours; more of the same walls add time, not accuracy."""
 _LEAST_ECHOES = 12
 _MAX_FLATNESS = 0.15
 """A block is a wall where its echoes spread this much less across than along (variances)."""
@@ -149,6 +149,8 @@ def _solved(problem: _Problem, prior: sp.csr_matrix, noise_m: float, block_m: fl
 def _arranged(tracks: Sequence[Track], max_echoes: int) -> _Problem:
     nodes, shares, centers, owners, pings, echoes, first = [], [], [], [], [], [], 0
     num_pings = 0
+    in_all = sum(len(track.poses) for track in tracks)
+    max_echoes = max(1, min(max_echoes, _MAX_ECHOES_IN_ALL // max(in_all, 1)))
     for t, track in enumerate(tracks):
         xy = track.poses[:, :2]
         way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
@@ -216,7 +218,7 @@ def _prior(
             )
         )
     drift = np.array([(t.drift_m, t.drift_m, t.drift_rad) for t in problem.tracks])
-    weight = 1.0 / (math.sqrt(_NODE_M) * drift[track])
+    weight = 1.0 / (math.sqrt(_NODE_M) * np.maximum(drift[track], _NOTHING))
     bends = [sp.diags(weight[:, axis]) @ rows[axis] for axis in range(3)]
     anchor = np.tile([1 / _ANCHOR_SIGMA_M] * 2 + [1 / _ANCHOR_SIGMA_RAD], num_nodes)
     of_tracks = np.repeat([1 / stretch_sigma, 1 / way_sigma, 1 / _MOUNTING_SIGMA_RAD], num_tracks)

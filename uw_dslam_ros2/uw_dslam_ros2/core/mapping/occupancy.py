@@ -116,6 +116,15 @@ class CompressedGrid:
     col: int
     resolution_m: float
 
+    @classmethod
+    def of(cls, occupancy: OccupancyMap) -> CompressedGrid:
+        """A map that `LogOddsGrid.to_occupancy` made, to the percent."""
+        spec = occupancy.spec
+        corner = spec.T_frame_grid
+        row, col = round(corner.y / spec.resolution_m), round(corner.x / spec.resolution_m)
+        data = zlib.compress(occupancy.units().tobytes(), 1)
+        return cls(data, spec.shape, row, col, spec.resolution_m)
+
     @property
     def spec(self) -> GridSpec:
         """Where it lies."""

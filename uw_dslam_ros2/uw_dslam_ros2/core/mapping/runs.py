@@ -131,6 +131,10 @@ class VehicleRuns:
         earlier = self._earlier.get(run_id)
         return None if earlier is None else earlier.issued(sequence)
 
+    def mappers(self) -> list[VehicleMapper]:
+        """Of all runs, in their order."""
+        return [*self._earlier.values(), self.mapper]
+
     def finish(self) -> list[Submap]:
         """End the last run; no ping may follow."""
         return self.mapper.finish()

@@ -61,6 +61,12 @@ class ClosedSection:
             return 0.0
         return float(np.quantile(np.linalg.norm(self.points - self.center, axis=1), 0.9))
 
+    def replace(self, submap: Submap) -> None:
+        """Be a later revision of what `to_submap` gave; points for matching stay as they are."""
+        self.grid = CompressedGrid.of(submap.grid)
+        self.trajectory, self.T_odom_issued = submap.trajectory, submap.T_odom_submap
+        self.revision = submap.revision
+
     def to_submap(
         self, vehicle_id: str, run_id: int, T_odom_submap: SE2, log_odds_max: float
     ) -> Submap:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,7 @@ class SubmapChain:
         self.estimator = make_estimator(config)
         self.closed: list[ClosedSection] = []
         self.growing: OpenSection | None = None
+        self._has_settled = False
 
     @property
     def is_empty(self) -> bool:
@@ -89,6 +90,19 @@ class SubmapChain:
                 return self._submap_of(section)
         return None
 
+    def submaps(self) -> list[Submap]:
+        """All closed ones, as they were given away last."""
+        return [self._submap_of(section) for section in self.closed]
+
+    def replace(self, drawn_anew: Sequence[Submap]) -> None:
+        """Take all closed submaps, in their order, as somebody drew and placed them anew.
+
+        None may follow.
+        """
+        for section, submap in zip(self.closed, drawn_anew, strict=True):
+            section.replace(submap)
+        self._has_settled = True
+
     # --- what they make together -----------------------------------------------------------------
 
     def T_odom_base(self, T_submap_base: SE2) -> SE2:  # noqa: N802 (a motion)
@@ -98,24 +112,30 @@ class SubmapChain:
         """
         if self.growing is None:
             T_submap_base = SE2.from_array(self.closed[-1].trajectory[-1])
-        return self.estimator.poses[-1] @ T_submap_base
+        return self._poses()[-1] @ T_submap_base
 
     def covariance(self, T_submap_base: SE2, own: FloatArray) -> FloatArray:
         """Covariance (3, 3) of that pose in odom; `own` (3, 3) is that in the submap."""
         if self.growing is None:
             T_submap_base, own = SE2(), np.zeros((3, 3))
         before = self.estimator.covariance()
-        return chained_covariance(self.estimator.poses[-1], before, T_submap_base, own)
+        return chained_covariance(self._poses()[-1], before, T_submap_base, own)
 
     def trajectory(self) -> tuple[NDArray[np.int64], FloatArray]:
         """Stamps (K,) and poses (K, 3) of base_link in odom at every ping, as best known now."""
-        return path_of(self.closed, self.growing, self.estimator.poses)
+        return path_of(self.closed, self.growing, self._poses())
 
     def occupancy(self) -> OccupancyMap:
         """All submaps, the one that grows included, in odom: as they were last issued."""
-        return self._map.draw(self.closed, self.growing, self.estimator.poses[-1])
+        return self._map.draw(self.closed, self.growing, self._poses()[-1])
 
     # --- inside ----------------------------------------------------------------------------------
+
+    def _poses(self) -> list[SE2]:
+        """``T_odom_submap`` of each: the graph's, until somebody places them anew."""
+        if self._has_settled:
+            return [section.T_odom_issued for section in self.closed]
+        return self.estimator.poses
 
     def _open(self, covariance: FloatArray) -> None:
         index = len(self.closed)

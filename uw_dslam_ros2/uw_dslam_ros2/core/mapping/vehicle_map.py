@@ -24,7 +24,7 @@ class VehicleMap:
     def __init__(self, config: OccupancyConfig) -> None:
         self._log_odds_max = config.log_odds_max
         self._mosaic = Mosaic(GridSpec(config.resolution_m, 1, 1))
-        self._left_out: dict[int, SE2] = {}
+        self._left_out: dict[int, tuple[int, SE2]] = {}
 
     @property
     def num_left_out(self) -> int:
@@ -40,12 +40,12 @@ class VehicleMap:
         """
         mosaic, newest = self._mosaic, len(closed)
         for index, section in enumerate(closed):
-            pose = section.T_odom_issued
-            if pose not in (mosaic.version_of(index), self._left_out.get(index)):
-                mosaic.put(index, pose, section.grid, pose)
+            version = section.revision, section.T_odom_issued
+            if version not in (mosaic.version_of(index), self._left_out.get(index)):
+                mosaic.put(index, version, section.grid, section.T_odom_issued)
                 if self._is_too_large():
                     mosaic.remove(index)
-                    self._left_out[index] = pose
+                    self._left_out[index] = version
                 else:
                     self._left_out.pop(index, None)
         if growing is not None:

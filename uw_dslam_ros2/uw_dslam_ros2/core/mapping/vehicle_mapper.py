@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -136,6 +137,18 @@ class VehicleMapper(VehicleNavigation):
     def issued(self, sequence: int) -> Submap | None:
         """A submap as it was given away last; None if there is none of this number."""
         return self._submaps.issued(sequence)
+
+    def submaps(self) -> list[Submap]:
+        """All closed submaps as they were given away last."""
+        return self._submaps.submaps()
+
+    def replace(self, drawn_anew: Sequence[Submap]) -> None:
+        """Take all submaps as they were drawn and placed anew; only after `finish`.
+
+        ``drawn_anew`` are `submaps`, in their order, as later revisions. Map, path and `issued`
+        are by these from now on.
+        """
+        self._submaps.replace(drawn_anew)
 
     # --- results
     # ----------------

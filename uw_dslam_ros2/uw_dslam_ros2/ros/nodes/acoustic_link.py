@@ -127,10 +127,13 @@ class AcousticLinkNode(Node):
 
     def _taken(self, msg: SubmapMsg, submap_id: SubmapId) -> list[Submap]:
         held = self._link.own_submap(submap_id)
-        if not msg.is_pose_only:
+        # Cells that are on their way are not sent once more where a mapper draws them anew.
+        is_known = held is not None and held.is_final and msg.revision > 0
+        if not msg.is_pose_only and not is_known:
             return self._link.add_submap(submap_from_msg(msg))
         if held is None:
             return []  # the mapper is asked for it
+        msg.is_pose_only = True
         return self._link.move_submap(submap_from_msg(msg, held))
 
     def _look_for_missing(self) -> None:

@@ -24,6 +24,7 @@ from uw_dslam_ros2.io.readings import PINGS, TransformEvent
 from uw_dslam_ros2.ros.plumbing.convention_watch import ConventionWatch
 from uw_dslam_ros2.ros.plumbing.diagnostics import Report
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, Transforms
+from uw_dslam_ros2.ros.plumbing.last_pass import LastPass
 from uw_dslam_ros2.ros.plumbing.managed_node import ManagedNode
 from uw_dslam_ros2.ros.plumbing.mapper_outputs import MapperOutputs
 from uw_dslam_ros2.ros.plumbing.mapper_services import MapperServices
@@ -68,7 +69,11 @@ class SonarMapper(ManagedNode):
                 "give one of them (-r __ns:=/auv_1)"
             )
         self._base_frame = self._config.base_frame or f"{self._vehicle_id}/base_link"
-        self._runs = VehicleRuns(self._mapper_config, self._vehicle_id, _draw_run_id)
+        occupancy = self._mapper_config.occupancy
+        self._last_pass = LastPass(occupancy, self.get_logger().warning)
+        self._runs = VehicleRuns(
+            self._mapper_config, self._vehicle_id, _draw_run_id, self._last_pass.pings
+        )
         self._order: StampOrder[SensorEvent] = StampOrder(
             int(self._reorder_s() * 1e9),
             int(_JUMP_BACK_S * 1e9),
@@ -131,9 +136,9 @@ class SonarMapper(ManagedNode):
 
     def _say_last(self) -> None:
         """Give the open submap away, if there is time."""
-        if not self._mapper.num_pings or self._is_finished:
+        if self._is_finished:
             return
-        job = self._worker.call(self.finish)
+        job = self._worker.call(self._close_last)
         try:
             job.result(_LAST_WORD_S)
         except Exception as error:  # noqa: BLE001 (it ends in any case)
@@ -302,6 +307,7 @@ class SonarMapper(ManagedNode):
             self._complain(f"{type(event).__name__} of {event.frame_id}: {error}")
             return
         self._outputs.publish_submaps(submaps)
+        self._last_pass.look()
         self._note_breaks()
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is None:
@@ -351,13 +357,12 @@ class SonarMapper(ManagedNode):
         return f"a new run begins; {self._runs.diagnostics()['num_submaps']} submaps lie before it"
 
     def finish(self) -> str:
-        """Close the last submap; nothing is mapped after that."""
+        """Close the last submap, and draw all of them anew; nothing is mapped after that."""
         if self._is_finished:
             return "finished before; nothing changes"
-        self._flush()
-        submaps = self._runs.finish()
-        self._outputs.publish_submaps(submaps)
-        self._is_finished = True
+        self._close_last()
+        drawn_anew = self._last_pass.draw(self._runs.mappers())
+        self._outputs.publish_submaps(drawn_anew, is_drawn_anew=True)
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is not None:
             self._publish_map(stamp_ns)
@@ -365,7 +370,13 @@ class SonarMapper(ManagedNode):
         return (
             f"{self._mapper_values['num_pings']} pings mapped into "
             f"{self._mapper_values['num_submaps']} submaps; {self._counts['num_bad']} bad messages"
+            f"; {len(drawn_anew)} submaps drawn anew"
         )
+
+    def _close_last(self) -> None:
+        self._flush()
+        self._outputs.publish_submaps(self._runs.finish())
+        self._is_finished = True
 
     # --- diagnostics -------------------------------------------------------------------------
 
@@ -377,6 +388,7 @@ class SonarMapper(ManagedNode):
             "num_frames": self._mountings.num_frames,
             "num_late": self._order.num_late,
             "num_waiting": self._worker.num_waiting,
+            "num_pings_not_kept": self._last_pass.pings.num_left_out,
             **self._mapper_values,
         }
         num_pings = self._mapper_values.get("num_pings", 0)

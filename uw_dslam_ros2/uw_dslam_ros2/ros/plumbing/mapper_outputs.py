@@ -60,12 +60,12 @@ class MapperOutputs:
         self.counts: Counter[str] = Counter()
         """Messages sent, for the diagnostics."""
 
-    def publish_submaps(self, submaps: Iterable[Submap]) -> None:
-        """Send submaps; of those that were sent before only the pose."""
+    def publish_submaps(self, submaps: Iterable[Submap], *, is_drawn_anew: bool = False) -> None:
+        """Send submaps; of those that were sent before only the pose, unless drawn anew."""
         for submap in submaps:
             self.counts["num_submap_messages"] += 1
-            # What is closed moves, and changes no more: a grid is a megabyte.
-            is_known = submap.submap_id in self._sent
+            # What is closed moves, and mostly changes no more: a grid is a megabyte.
+            is_known = submap.submap_id in self._sent and not is_drawn_anew
             self.counts["num_pose_messages"] += is_known
             self._submap_pub.publish(submap_to_msg(submap, is_pose_only=is_known))
             self._sent.add(submap.submap_id)
