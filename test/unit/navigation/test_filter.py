@@ -297,6 +297,15 @@ def test_fixes_teach_the_velocity_scale():
     assert navigation.sensor_errors()["velocity_scale"] == pytest.approx(-0.1, abs=0.01)
 
 
+def test_a_reference_at_a_forgotten_moment_is_refused():
+    """Else relative poses would go on to count from the one before, without a word."""
+    navigation = NavigationFilter()
+    for i in range(1001):
+        navigation.add_yaw(i * S // 10, 0.0)
+    with pytest.raises(InvalidInputError, match="forgotten"):
+        navigation.clone(10 * S)
+
+
 def test_nothing_measured_is_an_error_not_a_zero():
     with pytest.raises(InvalidInputError, match="no measurement"):
         NavigationFilter().pose_at(0)

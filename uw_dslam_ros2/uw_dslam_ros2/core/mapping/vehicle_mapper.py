@@ -18,6 +18,7 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (
     BeamGatherer,
     Beams,
+    Clouds,
     Detections,
     PlacedSweep,
     SonarImage,
@@ -37,6 +38,7 @@ _TURN_MEMORY_S = 120.0
 _AHEAD_NS = 1_000_000_000
 """At the end, beams this much newer than all navigation are placed by its last velocity."""
 _FAN_BEAM_RAD = 0.01
+_Cloud = tuple[int, ArrayLike, SE2, FloatArray | None]
 
 
 class VehicleMapper(VehicleNavigation):
@@ -70,6 +72,8 @@ class VehicleMapper(VehicleNavigation):
             "num_pings": 0, "num_pings_dropped": 0, "num_pings_empty": 0, "num_detections_last": 0,
         }  # fmt: skip
         self._gatherer = BeamGatherer()
+        self._clouds: Clouds[_Cloud] = Clouds()
+        self._late_s = 0.0
         # Until it is known what kind of sonar there is.
         self._navigation.remember(_TURN_MEMORY_S)
 
@@ -110,9 +114,12 @@ class VehicleMapper(VehicleNavigation):
         T_base_sonar: SE2,
         projection: FloatArray | None = None,
     ) -> list[Submap]:
-        """Detections (N, 2) [m] that somebody else made, in the sonar's frame."""
-        found = detections_from_points(stamp_ns, points, self._config.sonar)
-        return self._add(found, T_base_sonar, projection)
+        """Detections (N, 2) [m] that somebody else made, in the sonar's frame.
+
+        The first wait until it is known whether they are of a fan or of a sonar that turns.
+        """
+        cloud = (stamp_ns, points, T_base_sonar, projection)
+        return self._add_clouds(self._clouds.add(stamp_ns, points, cloud))
 
     def add_beams(
         self, beams: Beams, T_base_sonar: SE2, projection: FloatArray | None = None
@@ -128,7 +135,8 @@ class VehicleMapper(VehicleNavigation):
 
     def finish(self) -> list[Submap]:
         """Close the open submap, and settle the graph; no ping may follow."""
-        issued = self._add_sweeps(self._gatherer.take(None))
+        issued = self._add_clouds(self._clouds.take())
+        issued += self._add_sweeps(self._gatherer.take(None))
         if self._submaps.growing is None:
             return issued
         last_ns = int(self._submaps.growing.stamps_ns[-1])
@@ -223,17 +231,29 @@ class VehicleMapper(VehicleNavigation):
         if projection is not None:
             detections = detections.projected(projection)
         is_old = self._last_ping_ns is not None and detections.stamp_ns <= self._last_ping_ns
-        if is_old or not self._navigation.is_started:
+        oldest_ns, newest_ns = self._navigation.oldest_ns, self._navigation.stamp_ns
+        # Of a moment that is forgotten no pose is known.
+        if is_old or oldest_ns is None or newest_ns is None or detections.stamp_ns < oldest_ns:
             self._count("num_pings_dropped")
             return []
+        # Points of a turn come when it is over, and may be stamped with its middle.
+        is_turn = sweep is not None or detections.is_turn
+        self._late_s = max(self._late_s, (newest_ns - detections.stamp_ns) * 1e-9)
+        memory_s = _TURN_MEMORY_S if is_turn else min(_TURN_MEMORY_S, 4.0 * self._late_s)
+        self._navigation.remember(memory_s)
         if self._last_ping_ns is None:
-            # Points of a turn come when it is over, and may be stamped with its middle.
-            is_turn = sweep is not None or detections.is_turn
-            self._navigation.remember(_TURN_MEMORY_S if is_turn else 0.0)
-            # Echoes of a fan are as near to each other as its settings say, and come at once.
+            # Echoes of a fan are as near to each other as its settings say.
             self._suit(detections.beamwidth_rad if is_turn else _FAN_BEAM_RAD)
         self._last_ping_ns = detections.stamp_ns
         return self._process(detections, T_base_sonar, sweep)
+
+    def _add_clouds(self, clouds: list[_Cloud]) -> list[Submap]:
+        issued: list[Submap] = []
+        spacing_rad = self._clouds.turn_spacing_rad or 0.0
+        for stamp_ns, points, T_base_sonar, projection in clouds:
+            found = detections_from_points(stamp_ns, points, self._config.sonar, spacing_rad)
+            issued += self._add(found, T_base_sonar, projection)
+        return issued
 
     def _suit(self, beamwidth_rad: float) -> None:
         """Take settings that are left to the sonar from the first that is known of it."""

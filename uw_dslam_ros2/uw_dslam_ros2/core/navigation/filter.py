@@ -164,7 +164,15 @@ class NavigationFilter:
         self._add(stamp_ns, Fix(T_clone_base, information), (T_clone_base.x, T_clone_base.y))
 
     def clone(self, stamp_ns: int) -> None:
-        """Make the pose at `stamp_ns` the reference of relative poses from then on."""
+        """Make the pose at `stamp_ns` the reference of relative poses from then on.
+
+        Raises `InvalidInputError` for a moment before `oldest_ns`.
+        """
+        oldest_ns = self.oldest_ns
+        if self._early is None and oldest_ns is not None and stamp_ns < oldest_ns:
+            raise InvalidInputError(
+                f"the pose at {stamp_ns} ns is forgotten, expected {oldest_ns} or later"
+            )
         self._add(stamp_ns, Clone(), ())
 
     def pose_at(self, stamp_ns: int) -> tuple[SE2, FloatArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from uw_dslam_ros2.core.sonar.types import Detections, SonarImage
 __all__ = [
     "BeamEchoes",
     "beam_spacing",
+    "checked_points",
     "detect",
     "detections_from_points",
     "detections_from_scan",
@@ -29,6 +31,7 @@ __all__ = [
     "image_echoes",
     "polar",
     "scan_echoes",
+    "spacing_of_turn",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -42,6 +45,7 @@ reflector may have been missed.
 _WIDE_FAN_RAD, _RING_SHARE = (1.5, 4.0), 0.6
 """Of so wide a fan no wall fills so many beams at one range: that is the sea bed's or the
 surface's first echo, or another sonar's ping. A turn may be of a round basin."""
+_POINT_SPACING_RAD = 0.02
 _MIN_TURN_POINTS, _MAX_TURN_GAP_RAD, _TURN_SPACING_RAD = 30, 0.5 * np.pi, (0.01, 0.1)
 
 
@@ -88,27 +92,25 @@ def detections_from_points(
     stamp_ns: int,
     points: ArrayLike,
     config: SonarConfig = SonarConfig(),  # noqa: B008 (frozen)
-    beam_spacing_rad: float = 0.02,
+    turn_spacing_rad: float = 0.0,
 ) -> Detections:
     """Detections that somebody else has made, (N, 2) [m] in the sonar's frame (x forward, y left).
 
     Which beams met nothing is not known, so the water counts as free only before the nearest point
     of a bearing. Points all round are a turn of a sonar with a single beam: they lie as far from
-    one another as its beams, and come out in their order, not filtered by neighbours.
+    one another as its beams, and come out in their order, not filtered by neighbours. Of a sonar
+    that is known to turn (`Clouds`), so do few points, of beams ``turn_spacing_rad`` apart.
     """
-    xy = np.asarray(points, dtype=np.float64)
-    if xy.ndim != 2 or xy.shape[1] != 2:
-        raise InvalidInputError(f"points have shape {xy.shape}, expected (N, 2)")
-    if not np.isfinite(xy).all():
-        raise InvalidInputError("points hold coordinates that are not finite")
+    xy = checked_points(points)
     ranges = np.hypot(xy[:, 0], xy[:, 1])
     inside = (ranges >= config.min_range_m) & (ranges < config.max_range_m)
     xy, ranges = xy[inside], ranges[inside]
-    spacing_rad = _spacing_of_turn(xy)
+    own_spacing_rad = spacing_of_turn(xy)
+    spacing_rad = own_spacing_rad or turn_spacing_rad
     if spacing_rad > 0.0:
         order = np.argsort(np.arctan2(xy[:, 1], xy[:, 0]), kind="stable")
         xy, ranges = xy[order], ranges[order]
-    width = config.beamwidth_rad or spacing_rad or beam_spacing_rad
+    width = config.beamwidth_rad or spacing_rad or _POINT_SPACING_RAD
     keep = np.ones(len(xy), np.bool_)
     if spacing_rad == 0.0:
         keep = has_neighbors(xy, width, config)
@@ -116,6 +118,12 @@ def detections_from_points(
     unique, inverse = np.unique(beams, return_inverse=True)
     nearest = np.full(len(unique), np.inf)
     np.minimum.at(nearest, inverse, ranges)
+    if turn_spacing_rad > 0.0 and own_spacing_rad == 0.0:
+        # The beams without an echo were there, too; how far they saw is not known.
+        around = np.arange(math.floor(-np.pi / width), math.ceil(np.pi / width))
+        free = np.zeros(len(around))
+        free[np.searchsorted(around, unique)] = nearest
+        unique, nearest = around, free
     return Detections(
         stamp_ns,
         xy[keep],
@@ -127,7 +135,17 @@ def detections_from_points(
     )
 
 
-def _spacing_of_turn(points: FloatArray) -> float:
+def checked_points(points: ArrayLike) -> FloatArray:
+    """Points (N, 2); `InvalidInputError` for other shapes, and for coordinates not finite."""
+    xy = np.asarray(points, dtype=np.float64)
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise InvalidInputError(f"points have shape {xy.shape}, expected (N, 2)")
+    if not np.isfinite(xy).all():
+        raise InvalidInputError("points hold coordinates that are not finite")
+    return xy
+
+
+def spacing_of_turn(points: FloatArray) -> float:
     """How far points (N, 2) all round lie apart in bearing [rad]; 0: they are not all round."""
     if len(points) < _MIN_TURN_POINTS:
         return 0.0
