@@ -103,8 +103,12 @@ def test_the_largest_consistent_set_is_that_of_trying_all():
     rng = np.random.default_rng(2)
     poses = {(v, i): SE2(4.0 * i, 0.0, 0.1 * i) for v in "ab" for i in range(5)}
     exact = np.diag([1e-4, 1e-4, 1e-6])
-    source = Side({i: T for i, T in poses.items() if i[0] == "a"}, lambda _t, _s: exact)
-    target = Side({i: T for i, T in poses.items() if i[0] == "b"}, lambda _t, _s: exact)
+
+    def covariances(targets, _sources):
+        return np.array([exact] * len(targets))
+
+    source = Side({i: T for i, T in poses.items() if i[0] == "a"}, covariances)
+    target = Side({i: T for i, T in poses.items() if i[0] == "b"}, covariances)
     covariance = np.diag([0.04, 0.04, 0.001])
     T_b_a = SE2(3.0, -2.0, 0.7)
     edges = []

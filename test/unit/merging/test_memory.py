@@ -12,6 +12,7 @@ from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, shared_area_m2
 from uw_dslam_ros2.core.merging.types import Edge
+from uw_dslam_ros2.core.pose_graph import chained_covariance, invert_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, lawnmower_fleet
 
@@ -61,6 +62,23 @@ def test_meetings_are_those_of_looking_at_all_pairs(library, fleet):
     found = meetings(library, T_target_source, *sides, 1, 1000)
     assert set(found) == set(shares)
     assert shares[found[0]] == max(shares.values())
+
+
+def test_covariances_of_odometry_are_those_of_going_step_by_step(library):
+    odometry = library.odometry
+    steps = {edge.target: edge for edge in odometry.edges}
+    for first in library.active:
+        covariance, motion, here = np.zeros((3, 3)), SE2(), first
+        np.testing.assert_allclose(odometry.covariances([first], [first]), [covariance])
+        while here in steps:
+            step = steps[here]
+            covariance = chained_covariance(
+                motion, covariance, step.T_target_source, step.covariance
+            )
+            motion, here = motion @ step.T_target_source, step.source
+            both = odometry.covariances([first, here], [here, first])
+            back = invert_covariance(covariance, motion)
+            np.testing.assert_allclose(both, [covariance, back], rtol=1e-9, atol=1e-12)
 
 
 def test_vague_places_are_those_that_no_edge_makes_sure(library, fleet):

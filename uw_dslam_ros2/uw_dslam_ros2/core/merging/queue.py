@@ -81,7 +81,8 @@ class MapQueue:
         """
         asked = self._requests.keys()
         requests: list[MatchRequest] = []
-        for query in self._requests.unanswered(self._answers) or self._plan().wanted:
+        still_open = self._requests.unanswered(self._answers, len(self._submaps))
+        for query in still_open or self._plan().wanted:
             if len(requests) >= max_requests:
                 break
             if query.key not in asked:

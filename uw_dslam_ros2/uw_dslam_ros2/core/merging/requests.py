@@ -12,6 +12,8 @@ __all__ = ["Requests"]
 
 _REPLAN_SHARE = 0.125
 """Of a plan's questions: so many are answered before another plan is made."""
+_REPLAN_PER_SUBMAP = 0.005
+"""Or so many for each submap: a plan costs the more the more there are."""
 
 
 class Requests:
@@ -30,7 +32,7 @@ class Requests:
         """What is asked already."""
         return {query.key for query in self._in_flight.values()}
 
-    def unanswered(self, answers: Container[QueryKey]) -> list[Query]:
+    def unanswered(self, answers: Container[QueryKey], num_submaps: int) -> list[Query]:
         """Questions of the last plan, while few of them are answered; else none.
 
         A plan costs as much as many answers where there are many submaps, and a few answers change
@@ -38,7 +40,8 @@ class Requests:
         """
         still_open = [query for query in self.questions if query.key not in answers]
         num_answered = len(self.questions) - len(still_open)
-        return still_open if num_answered <= _REPLAN_SHARE * len(self.questions) else []
+        enough = max(_REPLAN_SHARE * len(self.questions), _REPLAN_PER_SUBMAP * num_submaps)
+        return still_open if num_answered <= enough else []
 
     def make(self, query: Query, library: Library) -> MatchRequest:
         """Ask a question."""

@@ -85,7 +85,7 @@ def _group(library: Library, component: Component, is_growing: bool) -> SubmapGr
         for submap_id in sorted(side.T_frame_submap):
             members.setdefault(submap_id.track, []).append(submap_id)
         begun = [i for ids in members.values() for i in ids[: 1 << (len(ids).bit_length() - 1)]]
-        side = Side({i: side.T_frame_submap[i] for i in begun}, side.covariance)
+        side = Side({i: side.T_frame_submap[i] for i in begun}, side.covariances)
     return library.component_group(side)
 
 

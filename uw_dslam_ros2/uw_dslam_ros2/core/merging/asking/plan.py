@@ -25,6 +25,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
+from uw_dslam_ros2.core.merging.checks.places import touching_tracks
 from uw_dslam_ros2.core.merging.checks.verification import Verifier
 from uw_dslam_ros2.core.merging.config import VAGUE_CELLS, MapQueueConfig
 from uw_dslam_ros2.core.merging.georeference import Georeference
@@ -157,8 +158,13 @@ class _Planner:
         number = {track: where[self._group_id(track)] for track in self._groups}
         sides = {t: self._library.component_side(components[i], t) for t, i in number.items()}
         found: list[Constraint] = []
+        near: set[frozenset[Track]] = set()
+        for component in components:
+            near |= touching_tracks(self._library, self._library.component_side(component))
+        near -= matched
         for target, source in itertools.combinations(sorted(self._groups), 2):
-            if number[source] == number[target] and frozenset((source, target)) not in matched:
+            pair = frozenset((source, target))
+            if number[source] == number[target] and pair in near:
                 found += self._verifier.constraints_nearby(sides[source], sides[target])
         return found
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+import itertools
+from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +15,10 @@ from uw_dslam_ros2.core.pose_graph import compose_covariances
 from uw_dslam_ros2.core.se2 import SE2, compose_poses, invert_poses
 from uw_dslam_ros2.core.submap import SubmapId, Track
 
-__all__ = ["Ends", "meetings", "pose_uncertainty", "sigma_m", "vague_places"]
+__all__ = ["Ends", "meetings", "pose_uncertainty", "sigma_m", "touching_tracks", "vague_places"]
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 Ends = tuple[SubmapId, SubmapId]
 """Source and target."""
 
@@ -25,8 +27,8 @@ _MIN_SHARE = 0.25
 _FULL_SHARE = 0.4
 """The same for a further constraint: who shares less must be as much vaguer to be worth one."""
 _ROUNDING_M = 1e-6
-_BLOCK = 256
-"""Circles that are compared with all others at a time."""
+_BLOCK, _BATCH = 256, 20_000
+"""Circles that are compared with all others, and ways between places, at a time."""
 
 
 def meetings(
@@ -40,7 +42,7 @@ def meetings(
     """Pairs of submaps that share most if the sides lie so; first those away from each other."""
     shares: list[tuple[float, SubmapId, SubmapId]] = []
     own, others = _Circles(library, source), _Circles(library, target)
-    for i, j in own.touching(others, T_target_source):
+    for i, j in zip(*own.touching(others, T_target_source), strict=True):
         source_id, target_id = own.ids[i], others.ids[j]
         T_between = target.T_frame_submap[target_id].inverse() @ (
             T_target_source @ source.T_frame_submap[source_id]
@@ -86,34 +88,49 @@ def vague_places(
     list
         Source and target, and the covariance (3, 3) of where the one lies in the other.
     """
-    sharing: dict[Ends, float] = {}
     circles = _Circles(library, side)
-    for i, j in circles.touching(circles):
-        target_id, source_id = circles.ids[i], circles.ids[j]
-        if source_id <= target_id:
-            continue
-        if chosen is not None and target_id not in chosen and source_id not in chosen:
-            continue
-        if not _is_apart(source_id, target_id, 2 * num_neighbours + 1):
-            continue
+    first, second = circles.touching(circles)
+    is_asked = (first < second) & circles.are_apart(first, second, 2 * num_neighbours + 1)
+    if chosen is not None:
+        is_chosen = np.array([submap_id in chosen for submap_id in circles.ids], np.bool_)
+        is_asked &= is_chosen[first] | is_chosen[second]
+    first, second = first[is_asked], second[is_asked]
+    pairs = [(circles.ids[j], circles.ids[i]) for i, j in zip(first, second, strict=True)]
+    limits_m = vague_cells * circles.cell_m[first]
+    ties = _Ties(side, edges)
+    # Most are sure enough over the edge that is the fewest steps away: what they share does not
+    # matter then.
+    is_open = ties.are_vague_over_nearest(pairs, limits_m)
+    sharing: dict[Ends, float] = {}
+    for index in np.flatnonzero(is_open).tolist():
+        source_id, target_id = ends = pairs[index]
         share = _share(library, source_id, target_id, side.between(target_id, source_id))
-        if share >= _MIN_SHARE:
-            sharing[source_id, target_id] = share
-    pairs = [*sharing]
-    cells_m = [
-        library.submaps[ends[1]].submap.grid.spec.resolution_m
-        * max(1.0, _FULL_SHARE / sharing[ends])
-        for ends in pairs
-    ]
+        is_open[index] = share >= _MIN_SHARE
+        sharing[ends] = share
+    limits_m, pairs = limits_m[is_open], list(itertools.compress(pairs, is_open))
+    surest = zip(pairs, limits_m.tolist(), *ties.surest(pairs), strict=True)
     candidates = [
-        (sharing[ends] * sigma, *ends, uncertainty)
-        for ends, uncertainty, sigma in _vague(pairs, vague_cells * np.array(cells_m), side, edges)
+        (sharing[ends] * sigma, *ends, covariance)
+        for ends, limit_m, covariance, sigma in surest
+        if sigma > limit_m * max(1.0, _FULL_SHARE / sharing[ends])
     ]
     candidates.sort(key=lambda item: (-item[0], item[1], item[2]))
     found = {
         (source_id, target_id): covariance for _, source_id, target_id, covariance in candidates
     }
     return [(ends, found[ends]) for ends in _spaced([*found], num_neighbours, limit, fill=False)]
+
+
+def touching_tracks(library: Library, side: Side) -> set[frozenset[Track]]:
+    """Pairs of tracks that may have seen the same somewhere."""
+    circles = _Circles(library, side)
+    first, second = circles.touching(circles)
+    is_between = circles.track[first] != circles.track[second]
+    numbers = np.column_stack([circles.track[first], circles.track[second]])[is_between]
+    return {
+        frozenset((circles.tracks[a], circles.tracks[b]))
+        for a, b in np.unique(numbers, axis=0).tolist()
+    }
 
 
 def pose_uncertainty(main: Edge | None, ends: Ends, source: Side, target: Side) -> FloatArray:
@@ -143,9 +160,8 @@ def _uncertainties(
         invert_poses(_stacked(source.T_frame_submap[main.source] for main in mains)),
         _stacked(source.T_frame_submap[end] for end, _ in ends),
     )
-    pairs = list(zip(mains, ends, strict=True))
-    by_target = np.array([target.covariance(end, main.target) for main, (_, end) in pairs])
-    by_source = np.array([source.covariance(main.source, end) for main, (end, _) in pairs])
+    by_target = target.covariances([end for _, end in ends], [main.target for main in mains])
+    by_source = source.covariances([main.source for main in mains], [end for end, _ in ends])
     none = np.zeros_like(motion)
     return (
         compose_covariances(by_target, none, T_target, compose_poses(motion, T_source))
@@ -169,44 +185,67 @@ def _sigmas_m(covariances: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(0.0, np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1]))
 
 
-def _vague(
-    pairs: Sequence[Ends], limits_m: FloatArray, side: Side, edges: Sequence[Edge]
-) -> list[tuple[Ends, FloatArray, float]]:
-    """Of pairs, those that neither odometry nor any single edge makes as sure as their limits.
+class _Ties:
+    """Edges within a side, by the two tracks that they join."""
 
-    With each, the least covariance (3, 3), and the standard deviation [m] that it means.
-    """
-    by_tracks: dict[tuple[Track, Track], list[Edge]] = {}
-    for edge in edges:
-        tracks = edge.source.track, edge.target.track
-        by_tracks.setdefault(tracks, []).append(edge)
-        if tracks[0] != tracks[1]:
-            by_tracks.setdefault(tracks[::-1], []).append(edge.reversed())
-    members: dict[tuple[Track, Track], list[int]] = {}
-    for index, (source_id, target_id) in enumerate(pairs):
-        members.setdefault((source_id.track, target_id.track), []).append(index)
-    found: list[tuple[Ends, FloatArray, float]] = []
-    for tracks, indices in members.items():
-        own, limits = [pairs[i] for i in indices], limits_m[indices]
-        joining = by_tracks.get(tracks, [])
-        if joining:
-            # Most are sure enough over the edge that is the fewest steps away.
-            steps = np.abs(_sequences(own)[:, None] - _sequences(_ends_of(joining))[None])
-            nearest = [joining[i] for i in steps.sum(axis=2).argmin(axis=1)]
-            is_vague = _sigmas_m(_uncertainties(nearest, own, side, side)) > limits
-            own = [ends for ends, is_open in zip(own, is_vague, strict=True) if is_open]
-            limits = limits[is_vague]
-        for ends, limit_m in zip(own, limits.tolist(), strict=True):
-            ways: list[FloatArray] = []
-            if not joining or tracks[0] == tracks[1]:
-                ways.append(side.covariance(ends[1], ends[0]))
+    def __init__(self, side: Side, edges: Sequence[Edge]) -> None:
+        self._side = side
+        self._by_tracks: dict[tuple[Track, Track], list[Edge]] = {}
+        for edge in edges:
+            tracks = edge.source.track, edge.target.track
+            self._by_tracks.setdefault(tracks, []).append(edge)
+            if tracks[0] != tracks[1]:
+                self._by_tracks.setdefault(tracks[::-1], []).append(edge.reversed())
+
+    def are_vague_over_nearest(
+        self, pairs: Sequence[Ends], limits_m: FloatArray
+    ) -> NDArray[np.bool_]:
+        """Whether pairs are less sure than limits (N,) over the edge that is nearest to each."""
+        members: dict[tuple[Track, Track], list[int]] = {}
+        for index, (source_id, target_id) in enumerate(pairs):
+            members.setdefault((source_id.track, target_id.track), []).append(index)
+        numbers: list[int] = []
+        nearest: list[Edge] = []
+        for tracks, indices in members.items():
+            joining = self._by_tracks.get(tracks)
             if joining:
-                ways += [*_uncertainties(joining, [ends] * len(joining), side, side)]
-            sigmas = _sigmas_m(np.array(ways))
-            best = int(sigmas.argmin())
-            if sigmas[best] > limit_m:
-                found.append((ends, ways[best], float(sigmas[best])))
-    return found
+                own = _sequences([pairs[index] for index in indices])
+                steps = np.abs(own[:, None] - _sequences(_ends_of(joining))[None])
+                nearest += [joining[i] for i in steps.sum(axis=2).argmin(axis=1)]
+                numbers += indices
+        is_vague = np.ones(len(pairs), np.bool_)
+        if nearest:
+            ends = [pairs[number] for number in numbers]
+            sigmas_m = _sigmas_m(_uncertainties(nearest, ends, self._side, self._side))
+            is_vague[numbers] = sigmas_m > limits_m[numbers]
+        return is_vague
+
+    def surest(self, pairs: Sequence[Ends]) -> tuple[FloatArray, FloatArray]:
+        """Least covariances (N, 3, 3) over odometry or single edges, and their deviations [m]."""
+        found = np.zeros((len(pairs), 3, 3))
+        sigmas_m = np.full(len(pairs), np.inf)
+
+        def compare(numbers: Sequence[int], covariances: FloatArray) -> None:
+            own = _sigmas_m(covariances)
+            all_numbers = np.array(numbers)
+            order = np.lexsort((np.arange(len(own)), own, all_numbers))
+            number, first = np.unique(all_numbers[order], return_index=True)
+            best = order[first]
+            is_less = own[best] < sigmas_m[number]
+            sigmas_m[number[is_less]] = own[best[is_less]]
+            found[number[is_less]] = covariances[best[is_less]]
+
+        joining = [self._by_tracks.get((s.track, t.track), []) for s, t in pairs]
+        alone = [n for n, (s, t) in enumerate(pairs) if not joining[n] or s.track == t.track]
+        if alone:
+            sources, targets = zip(*(pairs[n] for n in alone), strict=True)
+            compare(alone, self._side.covariances(targets, sources))
+        ways = ((number, edge) for number, edges in enumerate(joining) for edge in edges)
+        for batch in itertools.batched(ways, _BATCH):
+            numbers, mains = zip(*batch, strict=True)
+            ends = [pairs[number] for number in numbers]
+            compare(numbers, _uncertainties(mains, ends, self._side, self._side))
+        return found, sigmas_m
 
 
 def _sequences(pairs: Sequence[Ends]) -> NDArray[np.int64]:
@@ -222,19 +261,32 @@ class _Circles:
 
     def __init__(self, library: Library, side: Side) -> None:
         self.ids = sorted(side.T_frame_submap)
-        self._poses = _stacked(side.T_frame_submap[i] for i in self.ids).reshape(-1, 3)
-        self._radius_m = np.array([library.submaps[i].radius_m for i in self.ids])
+        own = [library.submaps[i] for i in self.ids]
+        self.cell_m = np.array([stored.submap.grid.spec.resolution_m for stored in own])
+        self._center = _stacked(side.T_frame_submap[i] for i in self.ids).reshape(-1, 3)[:, :2]
+        self._radius_m = np.array([stored.radius_m for stored in own])
+        numbers: dict[Track, int] = {}
+        self.track = np.array([numbers.setdefault(i.track, len(numbers)) for i in self.ids])
+        self._sequence = np.array([submap_id.sequence for submap_id in self.ids])
+        self.tracks = [*numbers]
 
-    def touching(self, others: _Circles, T_others_self: SE2 = SE2()) -> Iterator[tuple[int, int]]:
-        """Numbers of circles, each with one of the others that it may touch; in order."""
-        center = T_others_self.apply(self._poses[:, :2])
+    def touching(self, others: _Circles, T_others_self: SE2 = SE2()) -> tuple[IntArray, IntArray]:
+        """Numbers (N,) of circles, and (N,) those of others that each may touch; in order."""
+        center = T_others_self.apply(self._center)
+        found = [np.zeros((0, 2), np.int64)]
         for first in range(0, len(center), _BLOCK):
             block = slice(first, first + _BLOCK)
-            away = center[block, None] - others._poses[None, :, :2]
+            away = center[block, None] - others._center[None]
             reach = self._radius_m[block, None] + (others._radius_m + _ROUNDING_M)
             near = np.hypot(away[..., 0], away[..., 1]) <= reach
-            for i, j in np.argwhere(near).tolist():
-                yield first + i, j
+            found.append(np.argwhere(near) + np.array([first, 0]))
+        numbers = np.concatenate(found)
+        return numbers[:, 0], numbers[:, 1]
+
+    def are_apart(self, one: IntArray, other: IntArray, num_neighbours: int) -> NDArray[np.bool_]:
+        """Whether submaps (N,) are of different tracks, or more than so many steps apart."""
+        steps = np.abs(self._sequence[one] - self._sequence[other])
+        return (self.track[one] != self.track[other]) | (steps > num_neighbours)
 
 
 def _share(library: Library, source: SubmapId, target: SubmapId, T_target_source: SE2) -> float:
@@ -247,15 +299,18 @@ def _spaced(pairs: Sequence[Ends], num_neighbours: int, limit: int, *, fill: boo
     """The first ones whose maps share no submap; to fill the limit, then the others."""
     reach = 2 * num_neighbours
     chosen: list[Ends] = []
+    rest: list[Ends] = []
+    taken: dict[tuple[tuple[str, int], tuple[str, int]], list[tuple[int, int]]] = {}
     for pair in pairs:
         if len(chosen) >= limit:
             return chosen
-        if all(_is_apart(pair[0], s, reach) or _is_apart(pair[1], t, reach) for s, t in chosen):
+        source, target = pair
+        near = taken.setdefault((source[:2], target[:2]), [])
+        if all(
+            abs(source.sequence - s) > reach or abs(target.sequence - t) > reach for s, t in near
+        ):
+            near.append((source.sequence, target.sequence))
             chosen.append(pair)
-    rest = [pair for pair in pairs if pair not in chosen] if fill else []
-    return [*chosen, *rest][:limit]
-
-
-def _is_apart(one: SubmapId, other: SubmapId, num_neighbours: int) -> bool:
-    # Asked of pairs by the million: making their tracks would take longer than the comparison.
-    return one[:2] != other[:2] or abs(one.sequence - other.sequence) > num_neighbours
+        else:
+            rest.append(pair)
+    return [*chosen, *(rest if fill else [])][:limit]

@@ -34,13 +34,18 @@ _MAX_CLIQUE_EDGES = 60
 class Side:
     """Submaps placed in one frame, and how sure their relative poses are.
 
-    ``covariance(target, source)`` (3, 3) is that of ``T_target_source``. Sides of equal keys are
-    equal; None: nobody asks for the same one again.
+    ``covariances(targets, sources)`` (N, 3, 3) are those of ``T_target_source``. Sides of equal
+    keys are equal; None: nobody asks for the same one again.
     """
 
     T_frame_submap: Mapping[SubmapId, SE2]
-    covariance: Callable[[SubmapId, SubmapId], FloatArray]
+    covariances: Callable[[Sequence[SubmapId], Sequence[SubmapId]], FloatArray]
     key: bytes | None = None
+
+    def covariance(self, target: SubmapId, source: SubmapId) -> FloatArray:
+        """Covariance (3, 3) of ``T_target_source`` of two members."""
+        (found,) = self.covariances([target], [source])
+        return found
 
     def between(self, target: SubmapId, source: SubmapId) -> SE2:
         """``T_target_source`` of two members."""
@@ -82,9 +87,13 @@ def cycles_of(
     back = np.array([invert_covariance(e.covariance, e.T_target_source) for e in edges])
     covariances = [
         covariance[first],
-        np.array([source.covariance(edges[i].source, edges[j].source) for i, j in pairs]),
+        source.covariances(
+            [edges[i].source for i, _ in pairs], [edges[j].source for _, j in pairs]
+        ),
         back[second],
-        np.array([target.covariance(edges[j].target, edges[i].target) for i, j in pairs]),
+        target.covariances(
+            [edges[j].target for _, j in pairs], [edges[i].target for i, _ in pairs]
+        ),
     ]
     none = np.zeros((len(pairs), 3))
     last = compose_poses(motions[2], motions[3])

@@ -187,7 +187,7 @@ class Library:
     def side_of(self, ids: Sequence[SubmapId]) -> Side:
         """Submaps of one track, placed by its own odometry."""
         poses = {i: self.odometry.T_odom_submap(i) for i in ids}
-        return Side(poses, self.odometry.covariance)
+        return Side(poses, self.odometry.covariances)
 
     def component_side(self, component: Component, track: Track | None = None) -> Side:
         """The closed submaps of a component, or of one track in it, placed by the graph."""
@@ -196,15 +196,19 @@ class Library:
         poses = {i: component[i] for i in ids if i in component}
         first = {t: self.closed(t)[0] for t in tracks if t in self._by_track}
 
-        def covariance(target: SubmapId, source: SubmapId) -> FloatArray:
-            if target.track == source.track:
-                return self.odometry.covariance(target, source)
+        def covariances(targets: Sequence[SubmapId], sources: Sequence[SubmapId]) -> FloatArray:
+            over = [
+                source if source[:2] == target[:2] else first[target.track]
+                for target, source in zip(targets, sources, strict=True)
+            ]
+            found = self.odometry.covariances(targets, over)
             # Through each track's beginning: an honest guess from above.
-            return self.odometry.covariance(target, first[target.track]) + (
-                self.odometry.covariance(source, first[source.track])
-            )
+            across = [n for n, source in enumerate(sources) if source[:2] != targets[n][:2]]
+            ends = [sources[n] for n in across]
+            found[across] += self.odometry.covariances(ends, [first[end.track] for end in ends])
+            return found
 
-        return Side(poses, covariance)
+        return Side(poses, covariances)
 
     def holds(self, query: Query) -> bool:
         """Whether all submaps of a question are still in use."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.types import Edge
-from uw_dslam_ros2.core.pose_graph import chained_covariance, invert_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track
 
@@ -21,8 +20,8 @@ __all__ = ["Odometry"]
 
 FloatArray = NDArray[np.float64]
 
-_MAX_COVARIANCES = 100_000
-"""Kept of one track: all pairs of some three hundred submaps."""
+_MAX_VARIANCE = 1e10
+"""[m^2 or rad^2] Of one step: who knows less knows nothing, and sums with it stay exact."""
 
 
 class Odometry:
@@ -31,9 +30,10 @@ class Odometry:
     def __init__(self, submaps: Mapping[SubmapId, StoredSubmap], memory: Memory) -> None:
         self._submaps = submaps
         self._states: dict[Track, bytes] = {}
-        self._tracks: dict[Track, _TrackOdometry] = {}
+        self._row: dict[SubmapId, int] = {}
         self.edges: list[Edge] = []
         """The later submap is the source."""
+        tracks: list[_TrackOdometry] = []
         for track, members in itertools.groupby(sorted(submaps), key=lambda i: i.track):
             ids = list(members)
             hasher = hashlib.blake2b(repr(track).encode(), digest_size=16)
@@ -41,9 +41,12 @@ class Odometry:
                 hasher.update(b"%d" % submap_id.sequence + submaps[submap_id].fingerprint)
             state = hasher.digest()
             work = functools.partial(_TrackOdometry, ids, submaps, memory)
-            own = memory.remember(("odometry", state), work)
-            self._states[track], self._tracks[track] = state, own
-            self.edges += own.edges
+            tracks.append(memory.remember(("odometry", state), work))
+            self._states[track] = state
+            self._row |= {i: row for row, i in enumerate(ids, start=len(self._row))}
+            self.edges += tracks[-1].edges
+        self._poses = np.concatenate([track.poses for track in tracks] or [np.zeros((0, 3))])
+        self._sums = np.concatenate([track.sums for track in tracks] or [np.zeros((0, 3, 3))])
 
     def state(self, track: Track) -> bytes:
         """All that is known of a track's submaps, in short: equal ones have equal submaps."""
@@ -57,58 +60,62 @@ class Odometry:
         """Pose in the run's odom frame, by its newest revision."""
         return self._submaps[submap_id].submap.T_odom_submap
 
-    def covariance(self, target: SubmapId, source: SubmapId) -> FloatArray:
-        """Covariance (3, 3) of ``T_target_source`` of two submaps of one track."""
-        return self._tracks[target.track].covariance(target, source)
+    def covariances(self, targets: Sequence[SubmapId], sources: Sequence[SubmapId]) -> FloatArray:
+        """Covariances (N, 3, 3) of ``T_target_source`` of N times two submaps of one track."""
+        target = np.fromiter(map(self._row.__getitem__, targets), np.int64, len(targets))
+        source = np.fromiter(map(self._row.__getitem__, sources), np.int64, len(sources))
+        between = self._sums[np.maximum(target, source)] - self._sums[np.minimum(target, source)]
+        turned = -self._poses[target, 2]
+        return _carried(between, turned, _turned(self._poses[source, :2], turned))
 
     def spread(self, submap_id: SubmapId, members: Sequence[SubmapId]) -> FloatArray:
         """Mean covariance of the track's members around one of them: how far a map is bent."""
-        track = submap_id.track
-        own = [member for member in members if member.track == track]
-        return np.mean([self.covariance(submap_id, member) for member in own], axis=0)
+        own = [member for member in members if member.track == submap_id.track]
+        mean: FloatArray = self.covariances([submap_id] * len(own), own).mean(axis=0)
+        return mean
 
 
 class _TrackOdometry:
-    """Of one track, whose submaps do not change."""
+    """Of one track, whose submaps do not change.
+
+    Each step errs independently, by a shift and a turn about its end. Carried to the origin of
+    the odometry frame such errors add up, so that the covariance over any steps is a difference
+    of two sums, carried to where the source lies and seen in the target's frame.
+    """
 
     def __init__(
         self, ids: Sequence[SubmapId], submaps: Mapping[SubmapId, StoredSubmap], memory: Memory
     ) -> None:
-        self._pose = {i: submaps[i].submap.T_odom_submap for i in ids}
-        self._place = {submap_id: place for place, submap_id in enumerate(ids)}
-        self._covariances: dict[tuple[SubmapId, SubmapId], FloatArray] = {}
         self.edges: list[Edge] = []
         for before, after in itertools.pairwise(ids):
             ends = submaps[before], submaps[after]
             key = ("edge", before, after, ends[0].fingerprint, ends[1].fingerprint)
             self.edges.append(memory.remember(key, functools.partial(_edge, *ends)))
+        self.poses = np.array([submaps[i].submap.T_odom_submap.as_array() for i in ids])
+        # From the first one on: an odometry frame may be that of a map projection.
+        self.poses[:, :2] -= self.poses[0, :2].copy()
+        steps = np.array([edge.covariance for edge in self.edges]).reshape(-1, 3, 3)
+        steps /= np.maximum(1.0, np.trace(steps, axis1=1, axis2=2) / _MAX_VARIANCE)[:, None, None]
+        self.sums = np.zeros((len(ids), 3, 3))
+        carried = _carried(steps, self.poses[:-1, 2], -self.poses[1:, :2])
+        np.cumsum(carried, axis=0, out=self.sums[1:])
 
-    def covariance(self, target: SubmapId, source: SubmapId) -> FloatArray:
-        if target == source:
-            return np.zeros((3, 3))
-        held = self._covariances.get((target, source))
-        if held is not None:
-            return held
-        if len(self._covariances) > _MAX_COVARIANCES:
-            self._covariances.clear()
-        if target > source:
-            motion = self._pose[target].inverse() @ self._pose[source]
-            found = invert_covariance(self.covariance(source, target), motion.inverse())
-        else:
-            found = self._extended(target, source)
-        self._covariances[target, source] = found
-        return found
 
-    def _extended(self, target: SubmapId, source: SubmapId) -> FloatArray:
-        # Step by step from the target on: recursion would be as deep as the mission is long.
-        covariance, motion = np.zeros((3, 3)), SE2()
-        for step in self.edges[self._place[target] : self._place[source]]:
-            covariance = chained_covariance(
-                motion, covariance, step.T_target_source, step.covariance
-            )
-            motion = motion @ step.T_target_source
-            self._covariances[target, step.source] = covariance
-        return covariance
+def _carried(covariances: FloatArray, yaw: FloatArray, arm: FloatArray) -> FloatArray:
+    """Covariances (N, 3, 3) of motions: turned by (N,), then seen from the end of arms (N, 2)."""
+    jacobian = np.zeros((len(yaw), 3, 3))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 0, 2] = cos, -sin, -arm[:, 1]
+    jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = sin, cos, arm[:, 0]
+    jacobian[:, 2, 2] = 1.0
+    return jacobian @ covariances @ np.swapaxes(jacobian, 1, 2)
+
+
+def _turned(points: FloatArray, yaw: FloatArray) -> FloatArray:
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.column_stack(
+        [cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1]]
+    )
 
 
 def _edge(before: StoredSubmap, after: StoredSubmap) -> Edge:
