@@ -1,6 +1,7 @@
 """Each wrong convention is named, with what mends it; nothing is said where nothing is wrong."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -123,6 +124,34 @@ def test_nothing_is_said_where_nothing_is_wrong(recording):
     assert found.findings == []
     assert found.conventions.changes() == {}
     assert found.num_ping_motions > 40
+
+
+def test_a_velocity_along_the_worlds_axes_is_no_mounting(recording):
+    """As a filter's twist in its odom frame, sent as a DVL's."""
+    navigation, pings = recording
+    yaw = np.interp(navigation.velocity_s, navigation.imu_s, navigation.yaw_rad)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x, y = navigation.velocity_m_s.T
+    in_world = np.column_stack([cos * x - sin * y, sin * x + cos * y])
+    found = examine(replace(navigation, velocity_m_s=in_world), pings)
+    assert [f.kind for f in found.findings] == ["dvl_in_world"]
+    assert found.conventions.changes() == {}
+
+
+@pytest.mark.parametrize("turn_deg", [-25.0, 20.0])
+def test_a_sonar_that_was_knocked_is_told_with_time_and_angle(turn_deg):
+    navigation, pings = vehicle(3, 85.0)
+    points = tuple(
+        turned(p, -math.radians(turn_deg)) if t > 45.0 else p
+        for t, p in zip(pings.stamp_s, pings.points, strict=True)
+    )
+    found = examine(navigation, PingSample(pings.stamp_s, points, pings.T_base_sonar))
+    knock = next(f for f in found.findings if f.kind == "sonar_knocked")
+    at_s, degrees = (
+        float(word) for word in re.findall(r"(-?\d+) (?:s into|degrees)", knock.detail)
+    )
+    assert at_s == pytest.approx(45.0, abs=8.0)
+    assert degrees == pytest.approx(turn_deg, abs=4.0)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])

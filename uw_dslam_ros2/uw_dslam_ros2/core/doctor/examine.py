@@ -27,6 +27,7 @@ from uw_dslam_ros2.core.doctor.fits import (
 )
 from uw_dslam_ros2.core.doctor.images import judge_images
 from uw_dslam_ros2.core.doctor.imu import ImuState, compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.knocks import judge_knock
 from uw_dslam_ros2.core.doctor.odometry import OdometrySample, examine_odometry
 from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
 from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
@@ -41,6 +42,8 @@ _MIN_MOTIONS = 15
 _MIN_READINGS = 20
 _MIN_OFFSET_RAD = math.radians(4.0)
 _MIN_DRIFT_RAD_S = math.radians(0.05)
+_UNIT_LOG = math.log(1.3)
+_MAX_WAY_COST = 1.5  # of a velocity that explains how the echoes move
 
 
 def examine(
@@ -134,6 +137,9 @@ class _Trial:
             self._say_delays(find_delays(fits, lambda _: None, SURE, _LIKELY))
             return
         if reading == _Reading():
+            if self._is_velocity_in_world():
+                self._result.is_velocity_judged = True
+                return
             reading = self._velocity_side(reading)
         chosen = reading
         delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), SURE, _LIKELY)
@@ -146,11 +152,22 @@ class _Trial:
             if not fit.is_mirrored:
                 self._judge_offset(fit)
             judge_scale(self._result, fit)
+            late_s = delays.velocity_after_imu_s
+            judge_knock(
+                self._result, self._motions, fit, lambda part: self._fit(chosen, late_s, part)
+            )
 
-    def _fit(self, reading: _Reading, velocity_delay_s: float = 0.0) -> VelocityFit | None:
+    def _fit(
+        self,
+        reading: _Reading,
+        velocity_delay_s: float = 0.0,
+        motions: PingMotions | None = None,
+        *,
+        is_velocity_in_world: bool = False,
+    ) -> VelocityFit | None:
         assert self._yaw is not None
         return fit_velocity(
-            self._motions,
+            self._motions if motions is None else motions,
             self._navigation,
             reading.yaw_sign * self._yaw,
             self._delay_s,
@@ -158,6 +175,7 @@ class _Trial:
             sonar_yaw_rad=self._mount.yaw,
             is_sonar_mirrored=reading.is_sonar_mirrored,
             is_velocity_mirrored=reading.is_velocity_mirrored,
+            is_velocity_in_world=is_velocity_in_world,
             velocity_delay_s=velocity_delay_s,
         )
 
@@ -308,6 +326,25 @@ class _Trial:
                 confidence_in(offset, sigma),
                 velocity_yaw_offset_rad=round(offset, 4),
             )
+
+    def _is_velocity_in_world(self) -> bool:
+        """Say so where the velocity fits only along axes that do not turn with the vehicle."""
+        plain = self._fit(_Reading())
+        world = self._fit(_Reading(), is_velocity_in_world=True)
+        if plain is None or world is None or abs(math.log(world.scale)) > _UNIT_LOG:
+            return False
+        sure = confidence_of(world, plain)
+        if sure <= SURE or np.nanmean(world.cost) > _MAX_WAY_COST:
+            return False
+        self._result.tell(
+            "dvl_in_world",
+            "velocity",
+            "its velocity is along axes that do not turn with the vehicle (east and north, or "
+            "those of its odometry), while its message says along its own: have its driver give "
+            "it in the vehicle's frame",
+            sure,
+        )
+        return True
 
     # --- time
     # -------------------------------------------------------------------------------------------

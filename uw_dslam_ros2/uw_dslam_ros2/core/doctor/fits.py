@@ -19,6 +19,7 @@ __all__ = [
     "at_times",
     "believed",
     "confidence_of",
+    "confidence_of_lead",
     "fit_turns",
     "fit_velocity",
     "turn_bias",
@@ -168,6 +169,7 @@ def fit_velocity(
     sonar_yaw_rad: float,
     is_sonar_mirrored: bool = False,
     is_velocity_mirrored: bool = False,
+    is_velocity_in_world: bool = False,
     velocity_delay_s: float = 0.0,
 ) -> VelocityFit | None:
     """Turn and scale of the velocity that explain how the echoes move; None where too few do.
@@ -179,6 +181,7 @@ def fit_velocity(
     sonar : the sonar's place in base_link, x + iy [m]; `sonar_yaw_rad` its direction.
     is_sonar_mirrored : read the echoes with port and starboard exchanged.
     is_velocity_mirrored : read the velocity with its sideways axis the other way.
+    is_velocity_in_world : read the velocity along axes that do not turn with the vehicle.
     velocity_delay_s : how much later than the IMU's the velocity's stamps are.
     """
     grid = np.arange(navigation.imu_s[0], navigation.imu_s[-1], _STEP_S)
@@ -189,6 +192,8 @@ def fit_velocity(
     ) + 1j * at_times(stamped, navigation.velocity_s, navigation.velocity_m_s[:, 1])
     if is_velocity_mirrored:
         velocity = np.conj(velocity)
+    if is_velocity_in_world:
+        velocity = velocity * np.exp(-1j * yaw)
     lever = sonar - complex(*navigation.velocity_lever_m)
 
     begin = np.searchsorted(grid, motions.begin_s - delay_s)
@@ -267,5 +272,9 @@ def confidence_of[FitT: (TurnFit, VelocityFit)](better: FitT, worse: FitT) -> fl
     and those of the same moment as half of one.
     """
     both = np.isfinite(better.cost) & np.isfinite(worse.cost)
-    lead = float((worse.cost[both] - better.cost[both]).sum()) / (2.0 * better.repeats)
-    return float(scipy.special.expit(lead))
+    return confidence_of_lead(float((worse.cost[both] - better.cost[both]).sum()), better.repeats)
+
+
+def confidence_of_lead(lead: float, repeats: float) -> float:
+    """How sure a total cost is lower by `lead` not by chance, see `confidence_of`."""
+    return float(scipy.special.expit(lead / (2.0 * repeats)))

@@ -40,6 +40,13 @@ class PingMotions:
     def __len__(self) -> int:
         return len(self.begin_s)
 
+    def between(self, begin_s: float, end_s: float) -> PingMotions:
+        """Those that lie within a time."""
+        inside = (self.begin_s >= begin_s) & (self.end_s <= end_s)
+        return PingMotions(
+            self.begin_s[inside], self.end_s[inside], self.motion[inside], self.information[inside]
+        )
+
     @property
     def repeats(self) -> float:
         """How many motions tell of the same moment, at least 1."""
