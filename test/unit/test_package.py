@@ -120,8 +120,40 @@ def test_colcon_finds_the_tests_of_the_checkout():
     assert "testpaths = ../test/unit\n" in (PACKAGE / "setup.cfg").read_text()
 
 
-def test_the_release_tools_changelog_has_the_versions_of_the_changelog():
+PACKAGES = PACKAGE, ROOT / "uw_dslam_msgs"
+
+
+@pytest.mark.parametrize("folder", PACKAGES, ids=lambda folder: folder.name)
+def test_both_packages_are_released_together(folder):
+    root = ET.parse(folder / "package.xml").getroot()
+    assert root.findtext("name") == folder.name
+    version = root.findtext("version")
+    assert f'version="{version}"' in (PACKAGE / "setup.py").read_text()
+    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert {"author", "license", "maintainer"} <= {element.tag for element in root}
+    assert f"Changelog for package {folder.name}\n" in (folder / "CHANGELOG.rst").read_text()
+
+
+@pytest.mark.parametrize(
+    ("folder", "prefix", "names"),
+    [
+        (PACKAGES[0], "ament_", "copyright flake8 mypy pep257 xmllint"),
+        (
+            PACKAGES[1],
+            "ament_cmake_",
+            "copyright cppcheck cpplint flake8 lint_cmake pep257 uncrustify xmllint",
+        ),
+    ],
+    ids=["uw_dslam_ros2", "uw_dslam_msgs"],
+)
+def test_each_lint_of_ament_is_wired_or_switched_off_by_name(folder, prefix, names):
+    text = (folder / "package.xml").read_text()
+    assert [name for name in names.split() if prefix + name not in text] == []
+
+
+@pytest.mark.parametrize("folder", PACKAGES, ids=lambda folder: folder.name)
+def test_the_release_tools_changelog_has_the_versions_of_the_changelog(folder):
     versions = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.M)
-    text = (PACKAGE / "CHANGELOG.rst").read_text()
+    text = (folder / "CHANGELOG.rst").read_text()
     told = re.findall(r"^(Forthcoming|\d+\.\d+\.\d+)(?: \(.*\))?\n-+$", text, re.M)
     assert told == ["Forthcoming" if name == "Unreleased" else name for name in versions]
