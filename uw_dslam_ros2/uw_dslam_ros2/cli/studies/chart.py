@@ -28,7 +28,8 @@ from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import UNITS_PER_NAT, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid, LogOddsGrid
+from uw_dslam_ros2.core.mapping.log_odds_grid import LogOddsGrid
+from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.metrics import compare_maps, map_sharpness, trajectory_error

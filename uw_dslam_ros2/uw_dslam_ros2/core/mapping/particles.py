@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.log_odds_grid import LogOddsGrid
 from uw_dslam_ros2.core.mapping.loop_verdict import (
     MAX_WINDOW_M,
     MAX_WINDOW_RAD,
@@ -17,7 +18,6 @@ from uw_dslam_ros2.core.mapping.loop_verdict import (
 )
 from uw_dslam_ros2.core.mapping.loops import MIN_POINTS, nearby
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
-from uw_dslam_ros2.core.mapping.occupancy import LogOddsGrid
 from uw_dslam_ros2.core.mapping.rivals import conflict
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.pose_graph import compose_covariance

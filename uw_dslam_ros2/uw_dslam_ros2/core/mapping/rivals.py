@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import UNITS_PER_NAT
+from uw_dslam_ros2.core.mapping.log_odds_grid import CompressedGrid, LogOddsGrid
 from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points
-from uw_dslam_ros2.core.mapping.occupancy import CompressedGrid, LogOddsGrid
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.suppression import first_apart
