@@ -251,7 +251,7 @@ def test_noise_is_refused(data):
 
 def test_another_version_is_refused():
     other = bytes([LAYERS[Layer.COARSE][0] + 4]) + LAYERS[Layer.COARSE][1:]
-    with pytest.raises(InvalidInputError, match="version of the codec is 4, expected 3"):
+    with pytest.raises(InvalidInputError, match="version of the codec is 5, expected 4"):
         LayeredSubmap().add(other)
 
 

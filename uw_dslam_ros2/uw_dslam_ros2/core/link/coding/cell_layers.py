@@ -138,14 +138,13 @@ def write_coarse(
     path = read_path(_read_shape(head)[1])
     is_known = blocks_of_known(cells)
     free = _free_cells(is_known)
-    is_open = near_cells(free > 0)
-    walls = (cells == CELL_WALL) & is_open
+    walls = cells == CELL_WALL
     found = _tagged(head, unit, corner, _with_marked(free, walls), path, key)
     blocks = encode_marks(is_known, np.zeros(is_known.shape, np.int8))
     writer = begun(Layer.COARSE)
     writer.raw(found.tag + head)
     writer.varint(len(blocks))
-    writer.raw(blocks + encode_marks(walls, free, is_open))
+    writer.raw(blocks + encode_marks(walls, free))
     return bytes(writer), found
 
 
@@ -182,7 +181,7 @@ def _decoded_coarse(body: bytes, key: bytes) -> CellLayer:
     blocks = reader.raw(reader.varint())
     unknown = np.zeros((shape[0] // _BLOCK, shape[1] // _BLOCK), np.int8)
     free = _free_cells(decode_marks(blocks, unknown))
-    walls = decode_marks(reader.rest, free, near_cells(free > 0))
+    walls = decode_marks(reader.rest, free)
     return _tagged(head, unit, corner, _with_marked(free, walls), path, key)
 
 

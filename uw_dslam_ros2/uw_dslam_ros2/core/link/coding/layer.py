@@ -9,7 +9,7 @@ from uw_dslam_ros2.core.link.coding.fields import ByteReader, ByteWriter
 
 __all__ = ["CODEC_VERSION", "Layer", "begun", "head_of"]
 
-CODEC_VERSION = 3
+CODEC_VERSION = 4
 """Of layers; others are refused."""
 
 
