@@ -9,7 +9,7 @@ from uw_dslam_ros2.core.link.types import LinkConfig
 __all__ = ["Reporting", "fitted"]
 
 _PACKETS_PER_STATUS = 12  # between two reports while there is something else to send
-_HASTE = 0.3  # who has nothing else to say reports that much sooner
+_HASTE = 0.15  # who has nothing else to say reports that much sooner
 _MAX_UNANSWERED = 10
 
 

@@ -14,6 +14,7 @@ __all__ = ["OutItem", "Outbox"]
 
 _LOSS_LIMIT = 0.6  # beyond that, more repair in advance only crowds the others out
 _LOSS_MEMORY = 0.8
+_SPARE, _SPARE_LOSS = 1, 0.1  # repairs more, where turns would be left empty and packets get lost
 _LOSS_DOUBT = 5.0  # packets that are taken to have arrived before any report
 _MOST_TIMES = 12  # an item that was sent so often and not taken is refused there, not lost
 
@@ -106,20 +107,24 @@ class Outbox:
     def next_item(self, peers: Iterable[int]) -> OutItem | None:
         """The item of which a fragment should go next, or None.
 
-        Each goes out once as it is; what of it is sent afterwards is what some peer has said that
-        it lacks, and a little more where packets get lost.
+        Each goes out once, with as many sums as a listener is likely to need by the loss so far;
+        what of it is sent afterwards is what some peer has said that it lacks. Turns that would be
+        left empty carry one more of that, where packets get lost.
         """
         known = list(peers)
-        best: tuple[tuple[float, float, int], OutItem] | None = None
-        for item in self.items:
-            left = self._left(item, known)
-            if left <= 0:
-                continue
-            # Of two equally useful items the one that is complete sooner, then the older one.
-            order = (item.rank, left / max(1, item.parts), item.number)
-            if best is None or order < best[0]:
-                best = order, item
-        return None if best is None else best[1]
+        for spare in (0, _SPARE):
+            best: tuple[tuple[float, float, int], OutItem] | None = None
+            for item in self.items:
+                left = self._left(item, known, spare)
+                if left <= 0:
+                    continue
+                # Of two equally useful items the one that is complete sooner, then the older one.
+                order = (item.rank, left / max(1, item.parts), item.number)
+                if best is None or order < best[0]:
+                    best = order, item
+            if best is not None:
+                return best[1]
+        return None
 
     def cut(self, item: OutItem, max_bytes: int, sender: int, epoch: int, key: bytes) -> bytes:
         """The next fragment of an item, as a packet."""
@@ -149,19 +154,22 @@ class Outbox:
         known = list(peers)
         return sum(self._left(item, known) > 0 for item in self.items)
 
-    def _left(self, item: OutItem, peers: list[int]) -> int:
+    def _left(self, item: OutItem, peers: list[int], spare: int = 0) -> int:
         if item.is_void:
             return 0
         if item.num_sent == 0:
             return max(1, item.parts)
         if item.num_sent >= _MOST_TIMES * item.parts:
             return 0
-        left = item.parts - item.num_sent  # the first time, whoever hears it
+        # The first time, whoever hears it: as many as a listener is likely to need.
+        left = math.floor(item.parts / (1.0 - min(self.loss, _LOSS_LIMIT))) - item.num_sent
         for peer in peers:
             if (heard := item.peers.get(peer)) is None:
                 continue
             lacking, mark = heard
             if lacking and mark:
                 wanted = math.floor(lacking / (1.0 - min(self.loss, _LOSS_LIMIT)) + 0.5)
+                if self.loss > _SPARE_LOSS:
+                    wanted += spare
                 left = max(left, wanted - (item.num_sent - mark))
         return left
