@@ -140,11 +140,12 @@ def test_what_is_stated_does_not_leap_where_a_verdict_turns():
         return replace(GOOD, rivals=(PoseEvidence(agreement, 0.4, 12.0),))
 
     def with_decoy(share):
-        return replace(GOOD, decoy=replace(GOOD.best, surprise=6.0 + 30.0 * share))
+        decoy = replace(GOOD.best, surprise=6.0 + 30.0 * share)
+        return replace(GOOD, decoy=decoy, decoy_log_volume=16.0)
 
     def with_detail(share):
         best = replace(GOOD.best, agreement=_agreement(num_detail=30.0 * share))
-        return replace(GOOD, best=best, decoy=best)
+        return replace(GOOD, best=best, decoy=best, decoy_log_volume=16.0)
 
     for change in (with_rival, with_decoy, with_detail):
         told = [decide(change(share), config) for share in np.linspace(0.0, 1.0, 200)]

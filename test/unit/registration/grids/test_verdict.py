@@ -57,7 +57,7 @@ def random_case(rng):
             max_false_accept=rng.random(), min_overlap=0.4 * rng.random(),
         )  # fmt: skip
     if rng.random() < 0.5:
-        evidence = replace(evidence, decoy=random_pose(rng))
+        evidence = replace(evidence, decoy=random_pose(rng), decoy_log_volume=rng.uniform(5, 18))
     proof = Proof(
         is_complete=bool(rng.random() < 0.8), is_optimum=bool(rng.random() < 0.8),
         is_cancelled=bool(rng.random() < 0.05), num_boxes=9, score=0.41, lower_bound=0.5,
@@ -98,7 +98,7 @@ SENTENCES = {
         lambda c, _: 1.0 - c.max_false_accept,
         "least",
     ),
-    "nothing but straight walls agrees": (
+    "hardly more than straight walls agrees": (
         Verdict.AMBIGUOUS,
         lambda _, p: p,
         lambda c, _: 1.0 - c.max_false_accept,

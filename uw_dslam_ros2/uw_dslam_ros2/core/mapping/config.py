@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.navigation.config import NavigationConfig
@@ -109,6 +110,8 @@ class LoopRegistrationConfig(GridRegistrationConfig):
 
     The proof matters less here than the verdict: the window is small and many pairs are tried.
     """
+
+    may_be_mirrored: ClassVar[bool] = False  # both are drawn by the same conventions
 
     max_boxes: int = setting(20_000, 1000, 1_000_000_000, "boxes before the proof is given up")
     max_seconds: float = setting(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import ClassVar
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.errors import ConfigError
@@ -24,6 +25,9 @@ class GridRegistrationConfig(Config):
     Method paper judges points by the posterior of `RegistrationConfig`, always with a proof. So it
     refuses any other value than the default for what only the other method knows.
     """
+
+    # Whether one map may have left and right exchanged against the other.
+    may_be_mirrored: ClassVar[bool] = True
 
     method: str = setting(
         "signed",

@@ -189,12 +189,11 @@ class _GridMatch:
     ) -> Found:
         """With what explains the match otherwise: symmetries of a map, and a mirror.
 
-        They only matter to a match that would be convincing without them. Inside a prior window
-        nothing is asked of a mirror, which would move the window.
+        They only matter to a match that would be convincing without them.
         """
         if probability_of(found.evidence, is_alone=True) < _LOOK_FOR_DOUBTS:
             return found
-        if self._prior is None:
+        if self._config.may_be_mirrored:
             found = add_mirror_image(found, scales, pyramid, self._config)
         return add_symmetric_rivals(found, pyramid, window)
 

@@ -26,7 +26,6 @@ _MOST_CONFLICT = 0.4  # of the common walls lie on free space
 _IMPROBABLE_CONFLICT = 0.24  # where a match is not probable either, that is why
 _LIKE_SHARE = 0.8  # of the common walls agree where two places look alike
 _LOOSE_SHARE = 0.1  # of the walls' extent: less sure along its weakest direction is worth saying
-_LEAST_DETAIL = 1.0  # cells: with less, nothing that agrees is off a few straight lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +103,6 @@ class _Case:
         return lead_over_decoy(self.evidence, self.models)
 
     @property
-    def is_bare(self) -> bool:
-        """Whether nothing agrees but straight walls."""
-        return self.agreement.num_detail < _LEAST_DETAIL
-
-    @property
     def improbable(self) -> str:
         """The probability that is too small."""
         text = at_least(self.probability, self.least, ".2f")
@@ -180,7 +174,7 @@ _RULES: tuple[Rule[_Case, Verdict], ...] = (
         ),
     ),
     Rule(
-        lambda c: c.is_convincing and not c.is_probable and not c.is_bare,
+        lambda c: c.is_convincing and not c.is_probable and c.lead < 0.0,
         Verdict.AMBIGUOUS,
         lambda c: (
             "in a mirror the source agrees better than as it is, by odds of "
@@ -192,8 +186,9 @@ _RULES: tuple[Rule[_Case, Verdict], ...] = (
         lambda c: c.is_convincing and not c.is_probable,
         Verdict.AMBIGUOUS,
         lambda c: (
-            "nothing but straight walls agrees, and in a mirror, where no pose is right, they "
-            f"agree about as well: {c.improbable}; {c.measured}"
+            "hardly more than straight walls agrees, and in a mirror, where no pose is right, "
+            f"about as well: {c.improbable}; {c.agreement.num_detail:.0f} cells of detail, "
+            f"{c.measured}"
         ),
     ),
     Rule(
@@ -267,6 +262,7 @@ def _not_finite(evidence: MatchEvidence, proof: Proof) -> Iterator[str]:
     poses = [("", evidence.best), *((" of a rival", r) for r in evidence.rivals)]
     if evidence.decoy is not None:
         poses.append((" in a mirror", evidence.decoy))
+        numbers.append(("the number of poses in a mirror", evidence.decoy_log_volume))
     for whose, pose in poses:
         numbers += [(f"the score{whose}", pose.score), (f"the surprise{whose}", pose.surprise)]
         for field in dataclasses.fields(pose.agreement):
