@@ -1,5 +1,6 @@
 """Positions of recordings become fixes of the submaps that were mapped at their times."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,7 +11,7 @@ from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.earth import utm_position
-from uw_dslam_ros2.io.fixes import fixes_of_recordings
+from uw_dslam_ros2.io.fixes import FixLog, fixes_of_recordings
 from uw_dslam_ros2.io.readings import FixEvent
 from uw_dslam_ros2.io.session import load_session, save_session
 
@@ -87,3 +88,56 @@ def test_a_fix_of_a_stranger_is_refused():
     fixes = fixes_of_recordings({"auv_2": [event("auv_2", 3.0)]}, SUBMAPS, 1.0)
     with pytest.raises(ValueError, match=r"fix.submap_id is auv_2/0, which was never received"):
         queue.add_fixes(fixes)
+
+
+def test_what_comes_live_says_what_a_recording_says_in_whatever_order_it_comes(rng):
+    way = [(t, (1000.0, 2000.0 + t)) for t in (2.0, 25.0, 37.0, 52.0)]
+    sure = {25.0: 0.6, 52.0: 0.7}  # the others are taken for less sure: 1 m
+    found = []
+    for _ in range(4):
+        log = FixLog(0.5)
+        for index in rng.permutation(len(way)):
+            time_s, place = way[index]
+            log.note(event("auv_1/usbl", time_s, place, sigma_m=sure.get(time_s, 1.0)))
+        found.append(log.fixes(SUBMAPS))
+    assert all(fixes == found[0] for fixes in found)
+    events = {"auv_1": [event("auv_1", t, p, sigma_m=sure[t]) for t, p in way if t in sure]}
+    assert found[0] == fixes_of_recordings(events, SUBMAPS, 0.5), "the surest of each submap"
+
+
+def test_a_fast_receiver_needs_no_more_memory_than_a_slow_one():
+    slow, fast = FixLog(1.0), FixLog(1.0)
+    for tenth in range(600):
+        one = event("auv_1/gps/fix", tenth / 10.0)
+        fast.note(one)
+        if tenth % 100 == 0:
+            slow.note(one)
+    assert len(fast._kept) == len(slow._kept)
+    assert fast.fixes(SUBMAPS) == slow.fixes(SUBMAPS)
+
+
+def test_fixes_wait_for_their_vehicle_and_are_of_no_other():
+    log = FixLog(1.0)
+    log.note(event("auv_1/usbl", 5.0))
+    log.note(event("auv_10/usbl", 5.0))
+    assert log.fixes(SUBMAPS[2:]) == []
+    assert [fix.submap_id for fix in log.fixes(SUBMAPS)] == [SubmapId("auv_1", 1, 0)]
+    tenth = dataclasses.replace(SUBMAPS[0], vehicle_id="auv_10")
+    assert {fix.submap_id.vehicle_id for fix in log.fixes([*SUBMAPS, tenth])} == {
+        "auv_1",
+        "auv_10",
+    }
+
+
+def test_what_is_said_of_a_submap_takes_the_place_of_what_was_said():
+    queue = MapQueue()
+    for one in SUBMAPS:
+        queue.add_submap(one)
+    first, second = (
+        fixes_of_recordings({"auv_1": [event("auv_1", t, (x, 0.0)) for t in times]}, SUBMAPS, 1.0)
+        for times, x in (((5.0, 40.0), 1.0), ((45.0,), 2.0))
+    )
+    assert queue.add_fixes(first)
+    assert not queue.add_fixes(first)
+    assert queue.add_fixes(second)
+    assert queue.to_state().fixes == (first[0], second[0])

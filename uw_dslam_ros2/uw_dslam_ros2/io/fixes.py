@@ -9,13 +9,15 @@ import numpy as np
 
 from uw_dslam_ros2.core.merging import Fix
 from uw_dslam_ros2.core.merging.track_fixes import fixes_along
-from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.earth import utm_frame, utm_position
 from uw_dslam_ros2.io.readings import FixEvent
 
-__all__ = ["fixes_of_recordings"]
+__all__ = ["FixLog", "fixes_of_recordings"]
 
 _NO_NAME = "coordinates of the fixes"
+_SPAN_NS = 10_000_000_000
+"""Of a live stream so long says no more than the surest of its fixes, as in `fixes_along`."""
 
 
 def fixes_of_recordings(
@@ -55,6 +57,48 @@ def fixes_of_recordings(
                 frame,
             )
     return fixes
+
+
+class FixLog:
+    """Fixes that come one by one, in memory that grows with the minutes and not with the rate.
+
+    Their `vehicle_id` is the name of a topic: it is of the vehicle whose name it begins with.
+
+    Parameters
+    ----------
+    least_sigma_m
+        As in `fixes_of_recordings`.
+    """
+
+    def __init__(self, least_sigma_m: float) -> None:
+        self._least_sigma_m = least_sigma_m
+        self._kept: dict[tuple[str, str, int], FixEvent] = {}
+
+    def note(self, event: FixEvent) -> None:
+        """Take one, in any order."""
+        key = event.vehicle_id, event.frame_id, event.stamp_ns // _SPAN_NS
+        held = self._kept.get(key)
+        if held is None or self._worth(event) < self._worth(held):
+            self._kept[key] = event
+
+    def fixes(self, submaps: Iterable[Submap]) -> list[Fix]:
+        """The surest of each submap: a graph that grows is solved often."""
+        own = list(submaps)
+        vehicles = sorted({submap.vehicle_id for submap in own}, key=len, reverse=True)
+        events: dict[str, list[FixEvent]] = {}
+        for event in sorted(self._kept.values(), key=lambda e: (e.stamp_ns, e.frame_id)):
+            owner = next((v for v in vehicles if event.vehicle_id.startswith(f"{v}/")), None)
+            if owner is not None:  # else its first submap may still come
+                events.setdefault(owner, []).append(event)
+        surest: dict[SubmapId, Fix] = {}
+        for fix in fixes_of_recordings(events, own, self._least_sigma_m):
+            held = surest.get(fix.submap_id)
+            if held is None or fix.sigma_m < held.sigma_m:
+                surest[fix.submap_id] = fix
+        return list(surest.values())
+
+    def _worth(self, event: FixEvent) -> tuple[float, int]:
+        return _sigma_m(event, self._least_sigma_m), event.stamp_ns
 
 
 def _position(event: FixEvent, frame: str) -> tuple[float, float]:

@@ -202,8 +202,11 @@ class MapQueue:
         """How many these are."""
         return len(self._decisions)
 
-    def add_fixes(self, fixes: Sequence[Fix]) -> None:
+    def add_fixes(self, fixes: Sequence[Fix]) -> bool:
         """Take what instruments say of where submaps lie on earth; fixes of people are decisions.
+
+        What they said of the same submaps before does not hold any more. True if this says
+        something else.
 
         Raises
         ------
@@ -215,8 +218,13 @@ class MapQueue:
                 raise InvalidInputError(
                     f"fix.submap_id is {fix.submap_id}, which was never received"
                 )
-        self._now.fixes += tuple(fixes)
+        anew = {fix.submap_id for fix in fixes}
+        now = (*(f for f in self._now.fixes if f.submap_id not in anew), *fixes)
+        if now == self._now.fixes:
+            return False
+        self._now.fixes = now
         self._change()
+        return True
 
     def georeference(self) -> Georeference | None:
         """Where "map" lies on earth; None where the fixes do not say it."""

@@ -21,6 +21,7 @@ from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.session import load_session
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_id_of
 from uw_dslam_ros2.ros.plumbing.diagnostics import Report
+from uw_dslam_ros2.ros.plumbing.fix_inputs import FixInputs
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S
 from uw_dslam_ros2.ros.plumbing.group_maps import GroupMaps
 from uw_dslam_ros2.ros.plumbing.idle_timeout import IdleTimeout
@@ -106,6 +107,13 @@ class MapQueueManager(ManagedNode):
             complain=self.complain,
             submaps_of=self._submaps_of,
         )
+        self._fixes = FixInputs(
+            self,
+            self._config.fix_topics,
+            self._config.fix_sigma_m,
+            self._worker.post,
+            self.complain,
+        )
         self._frames = (
             QueueFrames(self, self._config.map_frame, self._maps.frame_of)
             if self._config.publishes_tf
@@ -127,6 +135,7 @@ class MapQueueManager(ManagedNode):
         """Submaps that come meanwhile are latched, and asked for where they are not."""
         self._topics.clear()
         self._maps.stop()
+        self._fixes.stop()
         self._worker.post(lambda: self._keeper.save_if_due(self._queue))
 
     def settings_changed(self) -> None:
@@ -242,6 +251,7 @@ class MapQueueManager(ManagedNode):
         self._requests.note_change()
         self._shared_decisions.note_change()
         self._keeper.note_change()
+        self._fixes.note_change()
 
     def _tick(self) -> None:
         self._is_tick_posted.clear()
@@ -259,6 +269,9 @@ class MapQueueManager(ManagedNode):
         for notice in self._queue.take_notices():
             self._message = notice
             self.get_logger().warning(self._queue.in_words(notice))
+        fixes = self._fixes.due(lambda: (record.submap for record in self._queue.submaps()))
+        if fixes and self._queue.add_fixes(fixes):
+            self.changed(f"{len(fixes)} submaps have position fixes")
         self._requests.look()
         # First saved, then told: what anybody has heard of outlives a kill.
         self._keeper.save_if_due(self._queue)
@@ -276,6 +289,7 @@ class MapQueueManager(ManagedNode):
     def _discover(self) -> None:
         self._requests.discover()
         self._maps.look()
+        self._fixes.look()
         if not self._config.vehicles:
             for topic, types in self.get_topic_names_and_types():
                 if _SUBMAP_TYPE in types:

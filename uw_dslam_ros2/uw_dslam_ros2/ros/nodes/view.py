@@ -16,7 +16,7 @@ from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.srv import Decide, GetSubmap, ListDecisions, ListRegistrations
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.merging import Decision, DecisionRecord
+from uw_dslam_ros2.core.merging import Decision
 from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, transform2d_from_msg
@@ -69,6 +69,7 @@ class View(Node):
         self._submaps: dict[SubmapId, Submap] = {}
         self._answers: list[tuple[Answer, bool]] = []
         self._num_answers = -1
+        self._told: tuple[object, ...] = ()
         self._on_change: Callable[[], None] = lambda: None
         self._showing = Showing([], [])
         self._status: MergeStatus | None = None
@@ -181,6 +182,9 @@ class View(Node):
             self._is_stopped.wait(max(_LEAST_PERIOD_S, pace.wait_s(time.monotonic())))
 
     def _show(self, status: MergeStatus) -> None:
+        told = (status.submaps, status.constraints, status.num_registrations, status.message)
+        if told == self._told:  # it speaks once a second even if nothing happens
+            return
         records = []
         for info in status.submaps:
             submap_id = SubmapId(info.vehicle_id, int(info.run_id), int(info.sequence))
@@ -195,20 +199,19 @@ class View(Node):
             self._answers = [answer_from_msg(msg) for msg in response.registrations]
             self._num_answers = status.num_registrations
         constraints = [constraint_from_msg(msg) for msg in status.constraints]
-        decisions: list[DecisionRecord] = []
+        listed = self._ask(self._list_decisions, ListDecisions.Request())
+        decisions = [decision_record_from_msg(msg) for msg in listed.decisions]
         georeference = None
-        if status.num_decisions:
-            listed = self._ask(self._list_decisions, ListDecisions.Request())
-            decisions = [decision_record_from_msg(msg) for msg in listed.decisions]
-            if listed.earth_frame:
-                T_earth_map = transform2d_from_msg(listed.t_earth_map, "t_earth_map")
-                georeference = listed.earth_frame, T_earth_map
+        if listed.earth_frame:
+            T_earth_map = transform2d_from_msg(listed.t_earth_map, "t_earth_map")
+            georeference = listed.earth_frame, T_earth_map
         showing = Showing(
             records, constraints, self._answers, self._showing, decisions, georeference
         )
         if showing.version != self._showing.version:
             self._showing = showing
             self._on_change()
+        self._told = told
 
     def _fetch(self, submap_id: SubmapId) -> Submap:
         request = GetSubmap.Request(

@@ -102,6 +102,17 @@ class MapQueueManagerConfig(Config):
     start_error_rad: float = setting(
         0.3, 0.001, 3.2, "how far each start pose may be turned [rad]"
     )
+    fix_topics: tuple[str, ...] = setting(
+        (),
+        doc="position fixes (GNSS, USBL) that pull the map, below the names of their vehicles: "
+        "[/auv_1/usbl, ...]; empty: none",
+    )
+    fix_sigma_m: float = setting(
+        0.0,
+        0.0,
+        1000.0,
+        "how far off fixes are that agree with each other [m]; none is taken for surer",
+    )
     servers: tuple[str, ...] = setting(
         (),
         doc="registration servers (node names) that are asked; empty: all on the graph",
