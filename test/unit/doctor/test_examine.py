@@ -154,6 +154,23 @@ def test_a_sonar_that_was_knocked_is_told_with_time_and_angle(turn_deg):
     assert degrees == pytest.approx(turn_deg, abs=4.0)
 
 
+@pytest.mark.parametrize("tilt_deg", [2.0, 15.0])
+def test_short_echoes_of_a_tilted_sonar_are_no_fault_of_the_dvl(recording, tilt_deg):
+    navigation, pings = recording
+    short = PingSample(
+        pings.stamp_s,
+        tuple(0.95 * points for points in pings.points),
+        pings.T_base_sonar,
+        tilt_rad=math.radians(tilt_deg),
+    )
+    found = examine(navigation, short)
+    (finding,) = found.findings
+    assert finding.kind == ("sonar_tilt" if tilt_deg > 5.0 else "dvl_scale")
+    if tilt_deg > 5.0:
+        scale = found.conventions.changes()["sonar_range_scale"]
+        assert scale == pytest.approx(1.0 / 0.95, abs=0.03)  # as of dvl_scale
+
+
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
 def test_wild_velocities_among_others_say_nothing_of_the_unit(recording, unit):
     navigation, pings = recording

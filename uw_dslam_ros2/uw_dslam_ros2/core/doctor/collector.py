@@ -51,6 +51,7 @@ class SampleCollector:
         self._pings: list[tuple[int, FloatArray]] = []
         self._beams: list[tuple[Beams, SE2, FloatArray | None]] = []
         self._T_base_sonar = SE2()
+        self._tilt_rad = 0.0
         self._levels: list[FloatArray] = []
 
     @property
@@ -158,6 +159,8 @@ class SampleCollector:
     ) -> list[Submap]:
         if projection is not None:
             detections = detections.projected(projection)
+            # What is left of the forward axis, seen from above.
+            self._tilt_rad = math.acos(min(1.0, float(np.hypot(*projection[:, 0]))))
         self._pings.append((detections.stamp_ns, detections.points))
         self._T_base_sonar = T_base_sonar
         return []
@@ -200,6 +203,7 @@ class SampleCollector:
             quantity_of(self._levels),
             self._sonar.intensity,
             decibels_per_count(self._levels),
+            self._tilt_rad,
         )
 
     @property

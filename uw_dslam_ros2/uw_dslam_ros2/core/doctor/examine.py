@@ -102,7 +102,7 @@ class _Trial:
         self._navigation = navigation
         self._imu = imu
         self._motions = motions
-        self._mount = pings.T_base_sonar
+        self._mount, self._tilt_rad = pings.T_base_sonar, pings.tilt_rad
         self._yaw: FloatArray | None = None
         self._delay_s = 0.0
         self._side_confidence = 1.0
@@ -151,7 +151,7 @@ class _Trial:
         if fit is not None:
             if not fit.is_mirrored:
                 self._judge_offset(fit)
-            judge_scale(self._result, fit)
+            judge_scale(self._result, fit, self._tilt_rad)
             late_s = delays.velocity_after_imu_s
             judge_knock(
                 self._result, self._motions, fit, lambda part: self._fit(chosen, late_s, part)

@@ -44,7 +44,8 @@ class PingSample:
 
     The points are in the sonar's frame, x forward and y to port; ``T_base_sonar`` is where the
     recording says that it sits. ``pixels`` is what images hold by their speckle (None: not
-    known), ``pixels_read_as`` what they are taken for, ``db_per_count`` a step of decibels.
+    known), ``pixels_read_as`` what they are taken for, ``db_per_count`` a step of decibels. ``tilt_rad`` is how far
+    the middle of the fan looks up or down; the points are projected by it already.
     """
 
     stamp_s: FloatArray
@@ -53,6 +54,7 @@ class PingSample:
     pixels: Quantity | None = None
     pixels_read_as: str = "amplitude"
     db_per_count: float = 0.0
+    tilt_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if (np.diff(self.stamp_s) < 0.0).any() or len(self.stamp_s) != len(self.points):

@@ -12,6 +12,7 @@ __all__ = ["confidence_in", "is_scale_wrong", "judge_scale"]
 _MIN_SCALE_ERROR = 0.019
 _USUAL_SCALE_ERROR = 0.015
 """A DVL and a speed of sound that are as good as data sheets say disagree by less."""
+_MIN_TILT_RAD = math.radians(5.0)  # from there on it costs more than instruments err
 _UNIT_SCALE = 1.3
 _UNIT_TOLERANCE = 0.025  # tells knots from half
 _UNITS = {
@@ -26,8 +27,11 @@ def is_scale_wrong(fit: VelocityFit) -> bool:
     return error >= _MIN_SCALE_ERROR and error - 2.0 * fit.factor_sigma >= _USUAL_SCALE_ERROR
 
 
-def judge_scale(result: Examination, fit: VelocityFit) -> None:
-    """Tell of a DVL whose unit or scale, or a sonar whose speed of sound, is wrong."""
+def judge_scale(result: Examination, fit: VelocityFit, tilt_rad: float = 0.0) -> None:
+    """Tell of a DVL whose unit or scale, or a sonar whose speed of sound, is wrong.
+
+    Of a sonar that looks up or down by ``tilt_rad`` it is said that it does.
+    """
     if not is_scale_wrong(fit):
         return
     if not 1.0 / _UNIT_SCALE < fit.scale < _UNIT_SCALE:
@@ -35,6 +39,19 @@ def judge_scale(result: Examination, fit: VelocityFit) -> None:
         return
     error = abs(fit.scale - 1.0)
     confidence = confidence_in(error - 0.5 * _MIN_SCALE_ERROR, fit.factor_sigma)
+    if fit.scale < 1.0 and tilt_rad > _MIN_TILT_RAD:
+        result.tell(
+            "sonar_tilt",
+            "sonar",
+            f"it looks {math.degrees(tilt_rad):.0f} degrees up or down, and its echoes move "
+            f"{100.0 * (1.0 - fit.scale):.1f} % less than the dvl says: tall beams meet a wall "
+            "nearer than their middle does, by which they are projected "
+            f"(conventions.sonar_range_scale: {1.0 / fit.scale:.3f}); mount it level where a true "
+            "map is wanted",
+            confidence,
+            sonar_range_scale=round(1.0 / fit.scale, 4),
+        )
+        return
     # Only the ratio shows. Instruments are set for the sea, 1500 m/s; colder or fresher water
     # makes one that is not set for it measure too long, and hardly any water too short.
     if fit.scale > 1.0:
