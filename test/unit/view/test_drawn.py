@@ -65,6 +65,34 @@ def test_a_state_that_follows_another_shows_what_it_shows_alone():
         assert showing.scene() == alone.scene()
 
 
+def test_fifty_groups_stand_side_by_side_and_fill_a_page():
+    one = next(iter(records().values()))
+    fleet = [
+        SubmapRecord(
+            dataclasses.replace(one.submap, vehicle_id=f"auv_{k}"),
+            SubmapState.MERGED if k == 0 else SubmapState.WAITING,
+            k,
+            SE2(yaw=0.1 * k),
+            0,
+            "",
+        )
+        for k in range(50)
+    ]
+    showing = Showing(fleet, [])
+    groups = showing.scene()["groups"]
+    assert groups[0]["shift"] == [0.0, 0.0], "the global map stays where it is"
+    boxes = np.array([group["bounds"] for group in groups])
+    low, high = boxes[:, :2], boxes[:, 2:]
+    for k in range(50):
+        others = np.arange(50) != k
+        apart = (low[k] >= high[others]) | (high[k] <= low[others])
+        assert apart.any(axis=1).all(), f"group {k} lies on another"
+    width, height = high.max(axis=0) - low.min(axis=0)
+    assert 0.5 < width / height < 4.0, "no strip of which a page shows nothing"
+    x_m, y_m = boxes[49, :2] + 0.5 * (high[49] - low[49])
+    assert showing.cell(x_m, y_m)["group"] == 49
+
+
 def test_going_back_in_time_leaves_the_newest_as_it_is():
     showing = Showing(list(records().values()), [])
     newest = tiles(showing)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.mosaic import SQUARE, Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.view.tiles import TILE_PIXELS, Layer, colours_of_percent, tile_png
 
@@ -58,3 +59,42 @@ def test_nothing_known_is_no_tile():
     unknown = OccupancyMap(GridSpec(0.1, 10, 10), np.full((10, 10), -1, np.int8))
     assert tile_png([Layer.of(unknown)], 3, 0, -1) is None
     assert tile_png([], 3, 0, 0) is None
+
+
+def test_a_large_map_costs_a_tile_no_more_than_what_it_shows():
+    """20,000 x 20,000 cells: bounded by squares asked for and bytes held, not by the clock."""
+    side = -(-20_000 // SQUARE)
+    asked = []
+    pattern = np.zeros((SQUARE, SQUARE), np.int8)
+    pattern[::16] = 100
+
+    def square(row, col):
+        asked.append((row, col))
+        return pattern
+
+    layer = Layer(GridSpec(0.1, 1, 1, SE2(0.0, 0.0, 0.3)), square)
+    squares = [(row, col) for row in range(side) for col in range(side)]
+    layer.change(squares)
+
+    def look(zoom, x_m, y_m):
+        """Squares asked for by the tile over a place."""
+        asked.clear()
+        tile_m = TILE_PIXELS * 2.0**-zoom
+        assert tile_png([layer], zoom, int(x_m // tile_m), int(-y_m // tile_m)) is not None
+        return len(asked)
+
+    middle = SE2(0.0, 0.0, 0.3).apply(np.array([[1000.0, 1000.0]]))[0]
+    zooms = range(-4, 7)
+    first = [look(zoom, *middle) for zoom in zooms]
+    assert first[0] == len(squares), "the whole map once, for the picture of all of it"
+    assert max(first[1:]) <= 150
+    assert layer.num_bytes < 70e6, "of 400 MB"
+    for step in range(40):  # over the map, near, as who drags it
+        place = SE2(0.0, 0.0, 0.3).apply(np.array([[100.0 + 40.0 * step, 300.0 + 30.0 * step]]))[0]
+        assert look(3, *place) <= 16
+    assert layer.num_bytes < 70e6
+    row, col = side // 2, side // 2
+    layer.change(
+        squares, Window(row * SQUARE, col * SQUARE, (row + 1) * SQUARE, (col + 1) * SQUARE)
+    )
+    assert max(look(zoom, *middle) for zoom in zooms) <= 150, "what changes is made anew, alone"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -42,7 +43,8 @@ __all__ = ["Showing"]
 
 FloatArray = NDArray[np.float64]
 
-_GAP_SHARE = 0.08  # of the page's width, between groups that stand side by side
+_GAP_SHARE = 0.08  # of the longest side of a group, between groups that stand side by side
+_ROW_ASPECT = 1.6  # a row of groups is so much longer than the square that would hold all
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,17 +265,22 @@ class Showing:
         return drawn
 
     def _side_by_side(self) -> dict[int, SE2]:
-        """Where each group's frame lies on the page: the first as it is, the others beside it."""
-        boxes = self._boxes
-        gap = _GAP_SHARE * sum(high_x - low_x for low_x, _, high_x, _ in boxes.values())
+        """Where each group's frame lies on the page: the first as it is, others in rows beside."""
+        sizes = {g: (x_1 - x_0, y_1 - y_0) for g, (x_0, y_0, x_1, y_1) in self._boxes.items()}
+        gap = _GAP_SHARE * max((side for size in sizes.values() for side in size), default=0.0)
+        area = sum((width + gap) * (height + gap) for width, height in sizes.values())
+        row_m = _ROW_ASPECT * math.sqrt(area)
         placed: dict[int, SE2] = {}
-        edge_m = top_m = 0.0
-        for group, (low_x, _, high_x, high_y) in boxes.items():
+        x_m = top_m = left_m = height_m = 0.0
+        for group, (low_x, _, _, high_y) in self._boxes.items():
+            width, height = sizes[group]
             if not placed:
-                placed[group], edge_m, top_m = SE2(), high_x, high_y
-            else:
-                placed[group] = SE2(edge_m + gap - low_x, top_m - high_y)
-                edge_m += gap + high_x - low_x
+                x_m = left_m = low_x
+                top_m = high_y
+            elif x_m > left_m and x_m + width > left_m + row_m:
+                x_m, top_m, height_m = left_m, top_m - height_m - gap, 0.0
+            placed[group] = SE2(x_m - low_x, top_m - high_y)
+            x_m, height_m = x_m + width + gap, max(height_m, height)
         for record in self.records:  # withdrawn ones may be alone in theirs
             placed.setdefault(record.component, SE2())
         return placed

@@ -18,6 +18,8 @@ __all__ = ["TILE_PIXELS", "Layer", "colours_of_percent", "png_bytes", "rectangle
 ByteArray = NDArray[np.uint8]
 
 TILE_PIXELS = 256
+_FINE_LEVELS, _MAX_FINE = 2, 512
+"""Squares held of these levels: 32 MB, some screens full."""
 _FREE = (247, 249, 250)  # red, green, blue
 _WALL = (22, 38, 54)
 
@@ -37,7 +39,8 @@ _COLOURS = colours_of_percent()
 class Layer:
     """A map and where it is shown, in squares of cells, which are made when they are looked at.
 
-    Each level is half as fine as the one before; walls outlast the rest.
+    Each level is half as fine as the one before; walls outlast the rest. Of the two finest, which
+    are nearly all of a map's bytes, only those are held that were looked at last.
 
     Parameters
     ----------
@@ -60,6 +63,7 @@ class Layer:
         self._square = square
         self._known: list[set[tuple[int, int]]] = [set()]
         self._made: dict[tuple[int, int, int], ByteArray] = {}
+        self._fine: dict[tuple[int, int, int], ByteArray] = {}  # the last looked at comes last
 
     @classmethod
     def of(cls, occupancy: OccupancyMap, T_view_map: SE2 = SE2()) -> Layer:
@@ -82,16 +86,23 @@ class Layer:
         self._known = [set(known)]
         if window is None:
             self._made.clear()
+            self._fine.clear()
             return
-        for level, row, col in list(self._made):
-            side = SQUARE << level
-            if (
-                row * side < window.row_1
-                and (row + 1) * side > window.row_0
-                and col * side < window.col_1
-                and (col + 1) * side > window.col_0
-            ):
-                del self._made[level, row, col]
+        for held in (self._made, self._fine):
+            for level, row, col in list(held):
+                side = SQUARE << level
+                if (
+                    row * side < window.row_1
+                    and (row + 1) * side > window.row_0
+                    and col * side < window.col_1
+                    and (col + 1) * side > window.col_0
+                ):
+                    del held[level, row, col]
+
+    @property
+    def num_bytes(self) -> int:
+        """Held for what was looked at."""
+        return sum(made.nbytes for held in (self._made, self._fine) for made in held.values())
 
     def sampled(
         self, x_m: NDArray[np.float64], y_m: NDArray[np.float64], pixel_m: float
@@ -134,21 +145,32 @@ class Layer:
 
     def _at(self, level: int, row: int, col: int) -> ByteArray:
         key = level, row, col
-        if key not in self._made:
+        if level >= _FINE_LEVELS:
+            if key not in self._made:
+                self._made[key] = self._coarser(*key)
+            return self._made[key]
+        made = self._fine.pop(key, None)
+        if made is None:
+            while len(self._fine) >= _MAX_FINE:
+                del self._fine[next(iter(self._fine))]
             if level == 0:
                 made = (self._square(row, col).view(np.uint8) + np.uint8(1)).astype(np.uint8)
             else:
-                fine = np.zeros((2 * SQUARE, 2 * SQUARE), np.uint8)
-                for i in (0, 1):
-                    for j in (0, 1):
-                        child = 2 * row + i, 2 * col + j
-                        if child in self._squares(level - 1):
-                            part = self._at(level - 1, *child)
-                            fine[i * SQUARE :, j * SQUARE :][:SQUARE, :SQUARE] = part
-                pairs = np.maximum(fine[::2], fine[1::2])
-                made = np.maximum(pairs[:, ::2], pairs[:, 1::2])
-            self._made[key] = made
-        return self._made[key]
+                made = self._coarser(*key)
+        self._fine[key] = made
+        return made
+
+    def _coarser(self, level: int, row: int, col: int) -> ByteArray:
+        """A square from the four of the level before."""
+        fine = np.zeros((2 * SQUARE, 2 * SQUARE), np.uint8)
+        for i in (0, 1):
+            for j in (0, 1):
+                child = 2 * row + i, 2 * col + j
+                if child in self._squares(level - 1):
+                    part = self._at(level - 1, *child)
+                    fine[i * SQUARE :, j * SQUARE :][:SQUARE, :SQUARE] = part
+        pairs = np.maximum(fine[::2], fine[1::2])
+        return np.asarray(np.maximum(pairs[:, ::2], pairs[:, 1::2]))
 
 
 def rectangle_of(spec: GridSpec, T_view_frame: SE2) -> tuple[float, float, float, float]:
