@@ -188,8 +188,8 @@ def _check_pings(vehicle: MappedVehicle, tell: _Tell) -> None:
         tell(
             "no_echoes",
             "sonar",
-            f"no echo was found in any of {mapped} pings: are the images black, or is the "
-            "threshold (mapper.sonar) too high?",
+            f"no echo was found in any of {mapped} pings: are the images black, or all white, or "
+            "is the threshold (mapper.sonar) too high?",
         )
     elif mapped >= _MANY and empty > _NEARLY_ALL * mapped:
         tell("few_echoes", "sonar", f"no echo was found in {empty} of {mapped} pings")
@@ -199,7 +199,7 @@ def _check_pings(vehicle: MappedVehicle, tell: _Tell) -> None:
             "few_matches",
             "sonar",
             f"only {matches} of {keys} key pings match what was seen before: the map is as good "
-            "as dead reckoning, or the sonar's frame, bearings or clock are wrong",
+            "as dead reckoning, or the sonar's frame, bearings, order of rows or clock are wrong",
         )
 
 

@@ -44,8 +44,9 @@ class PingSample:
 
     The points are in the sonar's frame, x forward and y to port; ``T_base_sonar`` is where the
     recording says that it sits. ``pixels`` is what images hold by their speckle (None: not
-    known), ``pixels_read_as`` what they are taken for, ``db_per_count`` a step of decibels. ``tilt_rad`` is how far
-    the middle of the fan looks up or down; the points are projected by it already.
+    known), ``pixels_read_as`` what they are taken for, ``db_per_count`` a step of decibels.
+    ``tilt_rad`` is how far the middle of the fan looks up or down; the points are projected by it
+    already.
     """
 
     stamp_s: FloatArray
