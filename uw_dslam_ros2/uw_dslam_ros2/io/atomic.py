@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from uw_dslam_ros2.core.errors import DataError
@@ -13,8 +13,10 @@ from uw_dslam_ros2.core.errors import DataError
 __all__ = ["write_files"]
 
 
-def write_files(contents: Mapping[Path, bytes]) -> list[Path]:
+def write_files(contents: Mapping[Path, bytes | Iterable[bytes]]) -> list[Path]:
     """Write files whole: all beside their places first, then each is renamed, in the order given.
+
+    A content may come in parts, which are asked for one after the other.
 
     A crash leaves every file either as it was or complete. Put the file that names the others
     last: whoever reads it finds them in place.
@@ -46,11 +48,11 @@ def write_files(contents: Mapping[Path, bytes]) -> list[Path]:
     return list(contents)
 
 
-def _write_beside(path: Path, content: bytes) -> Path:
+def _write_beside(path: Path, content: bytes | Iterable[bytes]) -> Path:
     descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
+            file.writelines([content] if isinstance(content, bytes) else content)
             file.flush()
             os.fsync(file.fileno())
         # mkstemp keeps files to their owner; maps are for sharing.

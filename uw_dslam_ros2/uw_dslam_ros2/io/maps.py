@@ -5,7 +5,7 @@ Image rows run from the top, grid rows from the lowest y: this module alone flip
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +14,7 @@ import yaml
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
-from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
+from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap, strips_of
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.map_image import read_image
 from uw_dslam_ros2.io.map_yaml import MapHeader
@@ -27,15 +27,25 @@ _OCCUPIED_THRESH = 0.65
 _FREE_THRESH = 0.196
 _PIXEL_OCCUPIED, _PIXEL_FREE, _PIXEL_UNKNOWN = 0, 254, 205
 _RAW_UNKNOWN = 255
-_SHADES = np.append(
-    np.rint(254.0 * (1.0 - np.arange(OCCUPIED + 1) / 100.0)), _PIXEL_UNKNOWN
-).astype(np.uint8)
+_PERCENT = np.append(np.arange(OCCUPIED + 1), UNKNOWN)
+_SHADES = np.where(_PERCENT < 0, _PIXEL_UNKNOWN, np.rint(254.0 * (1.0 - _PERCENT / 100.0))).astype(
+    np.uint8
+)
 """Grey of each value; that of -1 is the last."""
+_PIXELS = {
+    "trinary": np.select(
+        [_PERCENT > 50, (_PERCENT >= 0) & (_PERCENT < 50)],
+        [_PIXEL_OCCUPIED, _PIXEL_FREE],
+        _PIXEL_UNKNOWN,
+    ).astype(np.uint8),
+    "raw": np.where(_PERCENT < 0, _RAW_UNKNOWN, _PERCENT).astype(np.uint8),
+}
+"""Pixel of each value, by mode."""
 
 
 def image_of(occupancy: OccupancyMap) -> NDArray[np.uint8]:
     """Picture (R, C), first row on top: white is free, black occupied, 205 unknown."""
-    return np.flipud(_SHADES[occupancy.values])
+    return np.concatenate([*_looked_up(occupancy, _SHADES)])
 
 
 def write_map(
@@ -65,11 +75,7 @@ def write_map(
     yaml_path, pgm_path, png_path = (
         prefix.with_name(prefix.name + end) for end in (".yaml", ".pgm", ".png")
     )
-    if mode == "trinary":
-        pixels = _trinary_pixels(occupancy)
-    elif mode == "raw":
-        pixels = np.where(occupancy.known, occupancy.values.view(np.uint8), np.uint8(_RAW_UNKNOWN))
-    else:
+    if mode not in _PIXELS:
         raise InvalidInputError(f"mode is {mode!r}, expected 'trinary' or 'raw'")
     origin = occupancy.spec.T_frame_grid
     description = {
@@ -84,9 +90,9 @@ def write_map(
     text = yaml.safe_dump(
         description, sort_keys=False, default_flow_style=None, allow_unicode=True
     )
-    contents = {
-        pgm_path: _pgm_bytes(np.flipud(pixels)),
-        png_path: _png_bytes(image_of(occupancy)),
+    contents: dict[Path, bytes | Iterable[bytes]] = {
+        pgm_path: _pgm_parts(occupancy, _PIXELS[mode]),
+        png_path: _png_parts(occupancy),
         yaml_path: text.encode(),
     }
     return write_files(contents)
@@ -185,22 +191,24 @@ def _num_free_unknown(header: MapHeader, total: NDArray[np.uint32], white: int) 
     return int(np.count_nonzero(total == grey))
 
 
-def _trinary_pixels(occupancy: OccupancyMap) -> NDArray[np.uint8]:
-    pixels = np.full(occupancy.spec.shape, _PIXEL_UNKNOWN, dtype=np.uint8)
-    pixels[occupancy.values > 50] = _PIXEL_OCCUPIED
-    pixels[occupancy.known & (occupancy.values < 50)] = _PIXEL_FREE
-    return pixels
+def _looked_up(occupancy: OccupancyMap, table: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
+    """Rows of a picture from the top, in parts: a large map would be there several times."""
+    for strip in reversed(strips_of(occupancy.spec.num_rows)):
+        yield np.flipud(table[occupancy.values[strip.rows]])
 
 
-def _pgm_bytes(pixels: NDArray[np.uint8]) -> bytes:
-    header = f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n"
-    return header.encode() + np.ascontiguousarray(pixels).tobytes()
+def _pgm_parts(occupancy: OccupancyMap, table: NDArray[np.uint8]) -> Iterator[bytes]:
+    num_rows, num_cols = occupancy.spec.shape
+    yield f"P5\n{num_cols} {num_rows}\n255\n".encode()
+    for rows in _looked_up(occupancy, table):
+        yield rows.tobytes()
 
 
-def _png_bytes(pixels: NDArray[np.uint8]) -> bytes:
+def _png_parts(occupancy: OccupancyMap) -> Iterator[bytes]:
     import cv2  # large, and not every program has pictures
 
-    is_done, buffer = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    num_rows, num_cols = occupancy.spec.shape
+    is_done, buffer = cv2.imencode(".png", image_of(occupancy))
     if not is_done:
-        raise DataError(f"cannot encode a {pixels.shape[1]} x {pixels.shape[0]} picture as PNG")
-    return buffer.tobytes()
+        raise DataError(f"cannot encode a {num_cols} x {num_rows} picture as PNG")
+    yield buffer.tobytes()
