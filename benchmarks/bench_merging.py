@@ -84,7 +84,7 @@ def fleets(quick: bool) -> None:
     for size in (4, 8) if quick else (20, 50):
         fleet, queue = lawnmower_fleet(size, size, 0), MapQueue()
         last = [i for i in sorted(fleet.submaps) if i.sequence == size - 1][:_NUM_LATE]
-        settling, adding, asking = Timing(), Timing(), Timing()
+        settling, adding, drawing, asking = Timing(), Timing(), Timing(), Timing()
         for submap_id in sorted(fleet.submaps.keys() - set(last)):
             queue.add_submap(fleet.submaps[submap_id])
         matcher = KnowingMatcher(fleet)
@@ -93,7 +93,8 @@ def fleets(quick: bool) -> None:
         queue.is_growing = True
         queue.submaps()
         for submap_id in last:
-            timed(lambda f=fleet, q=queue, i=submap_id: _add_and_draw(q, f, i), adding)
+            timed(lambda f=fleet, q=queue, i=submap_id: _add_and_plan(q, f, i), adding)
+            timed(lambda q=queue: q.changed_window(), drawing)
             num_searches += timed(lambda q=queue, m=matcher: answer_all(q, m), asking)
         queue.is_growing = False
         num_searches += timed(lambda q=queue, m=matcher: answer_all(q, m), settling)
@@ -109,7 +110,8 @@ def fleets(quick: bool) -> None:
                 "num_searches": num_searches,
                 "rmse_m": fleet.position_rmse_m(queue),
                 "settle_cpu_s": seconds[-1],
-                **adding.row("add_plan_draw_"),
+                **adding.row("add_plan_"),
+                **drawing.row("draw_"),
                 **asking.row("ask_"),
                 "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
             },
@@ -150,6 +152,11 @@ def _check(fleet: Fleet, queue: MapQueue) -> None:
 def _add_and_draw(queue: MapQueue, fleet: Fleet, submap_id: SubmapId) -> None:
     queue.add_submap(fleet.submaps[submap_id])
     queue.changed_window()
+
+
+def _add_and_plan(queue: MapQueue, fleet: Fleet, submap_id: SubmapId) -> None:
+    queue.add_submap(fleet.submaps[submap_id])
+    queue.next_requests(0)
 
 
 def _slope(numbers: list[int], values: list[float]) -> float:

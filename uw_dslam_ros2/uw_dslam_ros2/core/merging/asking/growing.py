@@ -149,11 +149,12 @@ def _claims(library: Library, answers: Iterable[Answer]) -> dict[Pair, list[Answ
     found: dict[Pair, list[Answer]] = {}
     for answer in answers:
         query = answer.query
-        source = {submap_id.track for submap_id in query.source.ids}
-        target = {submap_id.track for submap_id in query.target.ids}
-        is_pair = query.prior is None and len(source) == len(target) == 1 and source != target
+        if query.prior is not None:
+            continue
+        source, target = library.tracks_of(query.source), library.tracks_of(query.target)
+        is_pair = len(source) == len(target) == 1 and source != target
         if is_pair and library.holds(query):
-            first, second = sorted(source | target)
+            first, second = sorted([*source, *target])
             found.setdefault((first, second), []).append(answer)
     for claims in found.values():
         claims.sort(key=lambda answer: (-_size(answer), answer.query.key))

@@ -89,11 +89,8 @@ def vague_places(
         Source and target, and the covariance (3, 3) of where the one lies in the other.
     """
     circles = _Circles(library, side)
-    first, second = circles.touching(circles)
-    is_asked = (first < second) & circles.are_apart(first, second, 2 * num_neighbours + 1)
-    if chosen is not None:
-        is_chosen = np.array([submap_id in chosen for submap_id in circles.ids], np.bool_)
-        is_asked &= is_chosen[first] | is_chosen[second]
+    first, second = circles.touching_each_other(chosen)
+    is_asked = circles.are_apart(first, second, 2 * num_neighbours + 1)
     first, second = first[is_asked], second[is_asked]
     pairs = [(circles.ids[j], circles.ids[i]) for i, j in zip(first, second, strict=True)]
     limits_m = vague_cells * circles.cell_m[first]
@@ -124,7 +121,7 @@ def vague_places(
 def touching_tracks(library: Library, side: Side) -> set[frozenset[Track]]:
     """Pairs of tracks that may have seen the same somewhere."""
     circles = _Circles(library, side)
-    first, second = circles.touching(circles)
+    first, second = circles.touching_each_other()
     is_between = circles.track[first] != circles.track[second]
     numbers = np.column_stack([circles.track[first], circles.track[second]])[is_between]
     return {
@@ -270,18 +267,40 @@ class _Circles:
         self._sequence = np.array([submap_id.sequence for submap_id in self.ids])
         self.tracks = [*numbers]
 
-    def touching(self, others: _Circles, T_others_self: SE2 = SE2()) -> tuple[IntArray, IntArray]:
-        """Numbers (N,) of circles, and (N,) those of others that each may touch; in order."""
-        center = T_others_self.apply(self._center)
+    def touching(
+        self, others: _Circles, T_others_self: SE2 = SE2(), own: IntArray | None = None
+    ) -> tuple[IntArray, IntArray]:
+        """Numbers (N,) of circles, and (N,) those of others that each may touch; in order.
+
+        Of all circles, or of some `own` ones.
+        """
+        own = np.arange(len(self.ids)) if own is None else own
+        center, radius_m = T_others_self.apply(self._center[own]), self._radius_m[own]
         found = [np.zeros((0, 2), np.int64)]
-        for first in range(0, len(center), _BLOCK):
-            block = slice(first, first + _BLOCK)
+        for start in range(0, len(own), _BLOCK):
+            block = slice(start, start + _BLOCK)
             away = center[block, None] - others._center[None]
-            reach = self._radius_m[block, None] + (others._radius_m + _ROUNDING_M)
-            near = np.hypot(away[..., 0], away[..., 1]) <= reach
-            found.append(np.argwhere(near) + np.array([first, 0]))
+            reach = radius_m[block, None] + (others._radius_m + _ROUNDING_M)
+            near = np.argwhere(np.hypot(away[..., 0], away[..., 1]) <= reach)
+            found.append(np.column_stack([own[near[:, 0] + start], near[:, 1]]))
         numbers = np.concatenate(found)
         return numbers[:, 0], numbers[:, 1]
+
+    def touching_each_other(
+        self, chosen: Container[SubmapId] | None = None
+    ) -> tuple[IntArray, IntArray]:
+        """Numbers of pairs that may touch, each once, the smaller number first; in order.
+
+        One of each pair must be among the chosen ones, if there are such.
+        """
+        if chosen is None:
+            first, second = self.touching(self)
+            is_once = first < second
+            return first[is_once], second[is_once]
+        own = np.flatnonzero([submap_id in chosen for submap_id in self.ids])
+        pairs = np.sort(np.column_stack(self.touching(self, own=own)), axis=1)
+        pairs = np.unique(pairs[pairs[:, 0] < pairs[:, 1]], axis=0)
+        return pairs[:, 0], pairs[:, 1]
 
     def are_apart(self, one: IntArray, other: IntArray, num_neighbours: int) -> NDArray[np.bool_]:
         """Whether submaps (N,) are of different tracks, or more than so many steps apart."""

@@ -116,10 +116,13 @@ class Library:
 
     def state_of(self, group: SubmapGroup) -> tuple[Hashable, ...]:
         """What is known of the tracks of a group, in short: equal ones are known alike."""
-        tracks = self._memory.remember(
+        return tuple(self._states.get(track) for track in self.tracks_of(group))
+
+    def tracks_of(self, group: SubmapGroup) -> list[Track]:
+        """The tracks of a group's submaps, sorted."""
+        return self._memory.remember(
             ("tracks", group.key), lambda: sorted({i.track for i in group.ids})
         )
-        return tuple(self._states.get(track) for track in tracks)
 
     def remember[T](self, key: Hashable, work: Callable[[], T]) -> T:
         """The result under a key that names all that it depends on."""
@@ -212,7 +215,8 @@ class Library:
 
     def holds(self, query: Query) -> bool:
         """Whether all submaps of a question are still in use."""
-        return all(i in self.active for i in (*query.source.ids, *query.target.ids))
+        groups = query.source, query.target
+        return all(group.T_reference_submap.keys() <= self.active.keys() for group in groups)
 
     def is_forbidden(self, query: Query) -> bool:
         """Whether people do not want a question asked: a place, or all that there is in it."""
