@@ -84,12 +84,9 @@ def reduced_layers(
 
     The window is whole blocks; first row and column are counted in cells of the finest layer.
     """
-    values = np.ascontiguousarray(values)
-    cells = {
-        Layer(number): reduce_cells(values, small, factor)
-        for number, factor in _FACTORS.items()
-        if number <= finest
-    }
+    factors = {Layer(n): factor for n, factor in _FACTORS.items() if n <= finest}
+    reduced = reduce_cells(values, small, factors.values())
+    cells = {layer: reduced[factor] for layer, factor in factors.items()}
     rows, cols = known_window(cells[Layer.COARSE])
     sides = [-(-max(1, window.stop - window.start) // _BLOCK) * _BLOCK for window in (rows, cols)]
     cut = {}

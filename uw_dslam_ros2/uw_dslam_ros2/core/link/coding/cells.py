@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import cv2
 import numpy as np
 from numba import njit
@@ -49,41 +51,54 @@ def levelled(occupancy: OccupancyMap, unit_m: float) -> OccupancyMap:
 
 
 @njit(cache=True, nogil=True)
-def _blocks(values, width, rows, cols, free_max, wall_min):  # type: ignore[no-untyped-def]
-    """Cells (rows, cols) of blocks of ``width`` x ``width`` of a map's cells [percent]."""
-    walls, free = np.zeros((rows, cols), np.int32), np.zeros((rows, cols), np.int32)
+def _counts(values, width, free_max, wall_min, walls, free):  # type: ignore[no-untyped-def]
+    """Count walls and free cells of a map [percent] in blocks of ``width`` x ``width``."""
     for row in range(values.shape[0]):
         block_row = row // width
         for block_col in range(-(-values.shape[1] // width)):
             num_walls, num_free = 0, 0
             for col in range(block_col * width, min(values.shape[1], (block_col + 1) * width)):
                 value = values[row, col]
+                if value < 0:
+                    continue
                 if value >= wall_min:
                     num_walls += 1
-                elif 0 <= value <= free_max:
+                elif value <= free_max:
                     num_free += 1
             walls[block_row, block_col] += num_walls
             free[block_row, block_col] += num_free
-    cells = np.zeros((rows, cols), np.int8)
-    for row in range(rows):
-        for col in range(cols):
-            if walls[row, col] >= max(1, (width + 1) // 2):
-                cells[row, col] = CELL_WALL
-            elif 3 * free[row, col] >= width * width:
-                cells[row, col] = CELL_FREE
-    return cells
 
 
-def reduce_cells(values: NDArray[np.int8], size: int, factor: int) -> CellArray:
-    """Cells of three values, `factor` blocks of ``size`` x ``size`` a side.
+def reduce_cells(
+    values: NDArray[np.int8], size: int, factors: Iterable[int]
+) -> dict[int, CellArray]:
+    """Cells of three values by factor, which divides three: `factor` blocks of ``size`` a side.
 
     A cell is a wall if half of a line through it is, else free if a third of it is, else unknown;
-    see `drop_specks` for the rest. For both of the factors 1 and 3 they begin at the map's first
-    cell and reach equally far.
+    see `drop_specks` for the rest. All begin at the map's first cell and reach equally far.
     """
-    rows, cols = (-(-length // (3 * size)) * (3 // factor) for length in values.shape)
-    cells = _blocks(values, factor * size, rows, cols, _FREE_MAX_PERCENT, _WALL_MIN_PERCENT)
-    return drop_specks(cells)
+    rows, cols = (-(-length // (3 * size)) * 3 for length in values.shape)
+    walls, free = np.zeros((2, rows, cols), np.int32)
+    _counts(np.ascontiguousarray(values), size, _FREE_MAX_PERCENT, _WALL_MIN_PERCENT, walls, free)
+    found = {}
+    for factor in factors:
+        width = factor * size
+        cells = np.zeros((rows // factor, cols // factor), np.int8)
+        cells[3 * _summed(free, factor) >= width * width] = CELL_FREE
+        cells[_summed(walls, factor) >= max(1, (width + 1) // 2)] = CELL_WALL
+        found[factor] = drop_specks(cells)
+    return found
+
+
+def _summed(counts: NDArray[np.int32], factor: int) -> NDArray[np.int32]:
+    """Over blocks of ``factor`` x ``factor``."""
+    if factor == 1:
+        return counts
+    found = np.zeros((counts.shape[0] // factor, counts.shape[1] // factor), np.int32)
+    for row in range(factor):
+        for col in range(factor):
+            found += counts[row::factor, col::factor]
+    return found
 
 
 def drop_specks(cells: CellArray) -> CellArray:
