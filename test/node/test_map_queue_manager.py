@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import time
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -452,10 +454,10 @@ def test_a_manager_that_starts_late_asks_for_what_it_missed(manage, ros_context)
     submaps = many_submaps(130)
     mapper = rclpy.create_node("sonar_mapper", namespace="auv_1", context=ros_context)
     publisher = mapper.create_publisher(SubmapMsg, "submap", SUBMAPS)
-    asked = []
+    asked = defaultdict(list)
 
     def give(request, response):
-        asked.append(request.sequence)
+        asked[request.sequence].append(time.monotonic())
         response.result = response.DONE
         response.submap = submap_to_msg(submaps[request.sequence])
         return response
@@ -464,8 +466,12 @@ def test_a_manager_that_starts_late_asks_for_what_it_missed(manage, ros_context)
     for submap in submaps:
         publisher.publish(submap_to_msg(submap))
     with manage(mapper, has_server=False, **FAST) as (until, probe, _):
-        until(lambda: len(probe.states()) == len(submaps), "all submaps")
-    assert len(set(asked)) == len(asked) >= len(submaps) - SUBMAPS.depth
+        until(lambda: len(probe.states()) == len(submaps), "all submaps", deadline_s=90.0)
+    assert len(asked) >= len(submaps) - SUBMAPS.depth
+    # An answer may get lost, where the middleware of a busy machine does not know the client yet:
+    # it is asked again, but not before it is overdue.
+    waits_s = [wait_s for times in asked.values() for wait_s in np.diff(times)]
+    assert all(wait_s > 0.5 * missing_submaps._TIMEOUT_S for wait_s in waits_s)
 
 
 def test_what_is_missing_and_cannot_be_had_is_told(manage, monkeypatch):
