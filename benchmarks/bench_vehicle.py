@@ -28,8 +28,9 @@ from uw_dslam_ros2.core.mapping import (
 from uw_dslam_ros2.core.mapping import vehicle_mapper as mapper_module
 from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.core.sonar import SonarImage
+from uw_dslam_ros2.io.drivers.projected_image import read_projected
+from uw_dslam_ros2.io.drivers.settings import ReadSettings
 from uw_dslam_ros2.io.interfaces import make_typestore
-from uw_dslam_ros2.io.messages import sonar_image_of
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, MissionConfig, PingMaker
 from uw_dslam_ros2.sim.mission import plan_mission as plan
@@ -189,7 +190,8 @@ def _mission_config(duration_s: float) -> MissionConfig:
 
 def _image_of(store: Any, data: bytes) -> SonarImage:
     message = store.deserialize_cdr(data, "marine_acoustic_msgs/msg/ProjectedSonarImage")
-    return sonar_image_of(message, "range_major")
+    (event,) = read_projected(message, ReadSettings(data_order="range_major"))
+    return event.image
 
 
 def _navigation(mission: Any) -> list[Callable[[VehicleMapper], None]]:
