@@ -225,14 +225,24 @@ class View(Node):
         return submap_from_msg(response.submap)
 
     def _ask(self, client: Any, request: Any) -> Any:
+        deadline_s = time.monotonic() + _ANSWER_WITHIN_S
+        # What is asked before the service is found is lost.
+        while not client.service_is_ready():
+            self._go_on(client, deadline_s)
+            self._is_stopped.wait(0.05)
         future, is_done = client.call_async(request), threading.Event()
         future.add_done_callback(lambda _: is_done.set())
-        deadline_s = time.monotonic() + _ANSWER_WITHIN_S
-        while not is_done.wait(0.2):
-            if time.monotonic() > deadline_s or self._is_stopped.is_set():
-                client.remove_pending_request(future)
-                raise TimeoutError(f"{client.srv_name} does not answer")
+        try:
+            while not is_done.wait(0.2):
+                self._go_on(client, deadline_s)
+        except TimeoutError:
+            client.remove_pending_request(future)
+            raise
         return future.result()
+
+    def _go_on(self, client: Any, deadline_s: float) -> None:
+        if time.monotonic() > deadline_s or self._is_stopped.is_set():
+            raise TimeoutError(f"{client.srv_name} does not answer")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
