@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.features.grid_filter import NUM_PARTS, clean_cells, coarsen, split
+from uw_dslam_ros2.core.features.grid_filter import clean_cells, coarsen, split
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.grids import preparation
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
@@ -82,17 +82,17 @@ def test_maps_of_large_cells_are_judged_on_smaller_ones(place):
 
 
 def test_what_is_said_on_half_cells_is_no_more_than_the_maps_hold():
-    """A thick wall of four cells for each of its own is neither four walls nor detail."""
+    """A thick wall of half cells counts by its length, and its thickness is no detail."""
     values = np.zeros((80, 80), np.int8)
     values[20:24, 10:70] = values[10:70, 20:25] = 100
     cells = clean_cells(OccupancyMap(GridSpec(0.1, 80, 80), values))
-    own, halved = WallMap(cells), WallMap(split(cells), NUM_PARTS)
+    own, halved = WallMap(cells), WallMap(split(cells), is_split=True)
     T = SE2(1.0, 0.0, 0.0)  # cells
     told, again = (
         measure_agreement(walls, walls, SE2(size * T.x, size * T.y, T.yaw))
         for walls, size in ((own, 1.0), (halved, 2.0))
     )
-    assert again.num_walls == pytest.approx(told.num_walls, abs=1)
+    assert again.num_walls == pytest.approx(2 * told.num_walls, abs=2)
     assert told.num_detail < 5.0
     assert again.num_detail < 5.0
     assert again.agreement == told.agreement == 1.0

@@ -166,10 +166,6 @@ def coarsen(cells: FilteredCells, resolution_m: float) -> FilteredCells:
     )
 
 
-NUM_PARTS = 4
-"""Cells that `split` makes of one."""
-
-
 def split(cells: FilteredCells) -> FilteredCells:
     """The same evidence on cells half as large: each of the four holds what the one held."""
     wall, free, known = (

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from uw_dslam_ros2.core.features.grid_filter import (
-    NUM_PARTS,
     FilteredCells,
     clean_cells,
     coarsen,
@@ -77,7 +76,7 @@ def _scales(finest: Sides) -> list[Sides]:
         ]
         scales.append((WallMap(cells[0]), WallMap(cells[1])))
     if spacing < _ENOUGH_SPACING:
-        source, target = (WallMap(split(walls.cells), NUM_PARTS) for walls in finest)
+        source, target = (WallMap(split(walls.cells), is_split=True) for walls in finest)
         scales.insert(0, (source, target))
     return scales
 
@@ -95,7 +94,7 @@ def in_a_mirror(walls: WallMap) -> WallMap:
         for values in (cells.wall, cells.free, cells.known, cells.row, cells.col)
     )
     image = FilteredCells(cells.resolution_m, wall, free, known, row, wall.shape[1] - col)
-    return WallMap(image, walls.num_copies)
+    return WallMap(image, walls.is_split)
 
 
 def _finest_resolution(source: OccupancyMap, target: OccupancyMap, num_cells: int) -> float:

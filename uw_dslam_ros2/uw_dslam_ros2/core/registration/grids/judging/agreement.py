@@ -25,7 +25,7 @@ class Agreement:
     """What two maps say about each other at a pose.
 
     ``overlap`` is the area seen by both over the smaller seen area. Of the wall cells of either
-    map inside the other's seen area (``num_walls``, copies of one counted once), ``agreement`` is
+    map inside the other's seen area (``num_walls``; of split cells, half), ``agreement`` is
     the share with a wall near and ``conflict`` the share on free space with none near.
     ``inlier_ratio`` of the source's wall cells have a partner. ``residual_cells`` is the root mean
     square distance of the partners. ``wall_share`` is the share of the common area that is that
@@ -47,11 +47,12 @@ class Agreement:
 class WallMap:
     """Distance to walls, free share and walls of a map, made once for all poses.
 
-    ``num_copies`` of its cells hold what one cell of the map does, and count as one.
+    ``is_split``: its cells are halves of those that the map has. So a wall is twice as thick as it
+    need be, and counts by its length: two cells are one.
     """
 
-    def __init__(self, cells: FilteredCells, num_copies: int = 1) -> None:
-        self.cells, self.num_copies = cells, num_copies
+    def __init__(self, cells: FilteredCells, is_split: bool = False) -> None:
+        self.cells, self.is_split = cells, is_split
         is_wall = cells.wall > 0.25
         self.distance = wall_distance(cells)
         self.free = cv2.boxFilter(cells.free, -1, (3, 3), borderType=cv2.BORDER_CONSTANT)
@@ -59,6 +60,7 @@ class WallMap:
         self.num_known = int(np.count_nonzero(known))
         # 0 unknown, 1 known, 2 known and near a wall
         self.seen = np.where(known, 1 + (self.distance <= _NEAR_CELLS), 0).astype(np.uint8)
+        self.thickness = _mean_thickness(is_wall)
         rows, cols = np.nonzero(is_wall)
         self.points = np.column_stack([cells.col[rows, cols], cells.row[rows, cols]]).astype(
             np.float64
@@ -68,6 +70,8 @@ class WallMap:
 _NUM_LINES = 4
 _NUM_LINE_ANGLES = 120
 _LINE_HALF_WIDTH_CELLS = 2.5
+_LEAST_SPLIT_THICKNESS = 2.0  # of a wall of half cells
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 _MOST_LINE_POINTS = 1500
 _NEAR_CELLS = 2.5
 _FAR_CELLS = 3.5
@@ -95,29 +99,36 @@ def measure_agreement(source: WallMap, target: WallMap, T_target_source: SE2) ->
         if walls is source:
             inliers = counts[1] / max(len(is_near), 1)
     overlap, wall_share = _common_area(source, target, T_target_source)
-    num_copies = max(source.num_copies, target.num_copies)
+    share, width = 1.0, _LINE_HALF_WIDTH_CELLS
+    if source.is_split:
+        share = 0.5
+        width += 0.5 * (max(source.thickness, target.thickness) - _LEAST_SPLIT_THICKNESS)
     return Agreement(
         overlap,
-        round(seen / num_copies),
+        round(share * seen),
         near / max(seen, 1),
         conflict / max(seen, 1),
         inliers,
         float(np.sqrt(square / max(near, 1))),
         wall_share,
-        near / num_copies * _detail_share(np.concatenate(agreeing), math.sqrt(num_copies)),
+        share * near * _detail_share(np.concatenate(agreeing), width),
     )
 
 
-def _detail_share(points: FloatArray, width: float) -> float:
-    """Share of points (N, 2) [cells] that lie off the few lines that hold most of them.
+def _mean_thickness(is_wall: NDArray[np.bool_]) -> float:
+    """Cells of the walls (R, C) over half of those at their rims, 2 at least."""
+    inner = cv2.erode(is_wall.astype(np.uint8), _CROSS, borderType=cv2.BORDER_CONSTANT)
+    num_walls = int(np.count_nonzero(is_wall))
+    return 2.0 * num_walls / max(num_walls - int(np.count_nonzero(inner)), 1)
 
-    A line is ``width`` times as wide as for cells that are as large as those of the maps.
-    """
+
+def _detail_share(points: FloatArray, half_width: float) -> float:
+    """Share of points (N, 2) [cells] that lie off the few lines that hold most of them."""
     if len(points) == 0:
         return 0.0
     some = points[:: -(-len(points) // _MOST_LINE_POINTS)]
     left = off_strongest_lines(
-        np.ascontiguousarray(some), _NUM_LINES, _NUM_LINE_ANGLES, width * _LINE_HALF_WIDTH_CELLS
+        np.ascontiguousarray(some), _NUM_LINES, _NUM_LINE_ANGLES, half_width
     )
     return float(left.mean())
 
