@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from uw_dslam_ros2.core.errors import UwDslamError
 from uw_dslam_ros2.sim.instruments import HEADING_SOURCES
-from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
+from uw_dslam_ros2.sim.mission import ALL_SONAR_KINDS, MissionConfig
 from uw_dslam_ros2.sim.places import PLACES
 from uw_dslam_ros2.sim.recording import simulate_mission
 from uw_dslam_ros2.sim.sway import SwayConfig
@@ -40,9 +40,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--sonar",
-        choices=SONAR_KINDS,
+        choices=ALL_SONAR_KINDS,
         default=default.sonar_kind,
-        help="a fan of beams at once, or one beam that turns in 14 s",
+        help="a fan of beams at once, one beam that turns in 14 s, or points in space (3-D)",
     )
     parser.add_argument(
         "--message",

@@ -215,9 +215,11 @@ class MessageFactory:
         )
 
     def points(self, stamp_ns: int, frame_id: str, points: ArrayLike) -> Any:
-        """``sensor_msgs/PointCloud2`` (x, y, z float32, z = 0) of points (N, 2) [m]."""
-        flat = np.zeros((len(np.asarray(points)), 3), dtype="<f4")
-        flat[:, :2] = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        """``sensor_msgs/PointCloud2`` (x, y, z float32) of points (N, 2) or (N, 3) [m]; z is 0."""
+        given = np.asarray(points, dtype=np.float64)
+        given = given if given.ndim == 2 else given.reshape(-1, 2)
+        flat = np.zeros((len(given), 3), dtype="<f4")
+        flat[:, : given.shape[1]] = given
         point_field = self._types["sensor_msgs/msg/PointField"]
         fields = [
             point_field(name=name, offset=4 * i, datatype=_POINT_FLOAT32, count=1)

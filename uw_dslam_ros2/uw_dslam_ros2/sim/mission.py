@@ -18,6 +18,7 @@ from uw_dslam_ros2.sim.paths import SurveyArea, plan_survey, split_areas
 from uw_dslam_ros2.sim.places import PLACES, make_place
 from uw_dslam_ros2.sim.sonar import Intruder, SonarConfig, SonarSimulator
 from uw_dslam_ros2.sim.sonar_model import power_of_db
+from uw_dslam_ros2.sim.space_sonar import SpacePing, SpaceSonarConfig, SpaceSonarSimulator
 from uw_dslam_ros2.sim.sway import SwayConfig, fan_in_space, rotation_level_base
 from uw_dslam_ros2.sim.turning import (
     TurningSonarConfig,
@@ -28,6 +29,7 @@ from uw_dslam_ros2.sim.vehicle import DriveConfig, Motion, drive
 from uw_dslam_ros2.sim.world import World
 
 __all__ = [
+    "ALL_SONAR_KINDS",
     "SONAR_HEIGHT_M",
     "SONAR_KINDS",
     "T_BASE_DVL",
@@ -56,6 +58,8 @@ T_BASE_DVL = SE2(-0.10, 0.05, 0.0)
 
 SONAR_KINDS = ("imaging", "turning")
 """A fan of beams at once, or one beam that turns."""
+ALL_SONAR_KINDS = (*SONAR_KINDS, "space")
+"""Also one that hears in three dimensions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +75,12 @@ class MissionConfig(Config):
         0.3, 0.0, 0.95, "part of an area's width that the next vehicle surveys too"
     )
     clearance_m: float = setting(4.0, 1.0, 20.0, "distance kept from walls [m]")
-    sonar_kind: str = setting("imaging", choices=SONAR_KINDS, doc="what the vehicles carry")
+    sonar_kind: str = setting("imaging", choices=ALL_SONAR_KINDS, doc="what the vehicles carry")
     ping_rate_hz: float = setting(3.0, 0.2, 30.0, "imaging: sonar pings per second")
     truth_resolution_m: float = setting(0.05, 0.01, 2.0, "cell size of the true map [m]")
     sonar: SonarConfig = setting(SonarConfig())
     turning: TurningSonarConfig = setting(TurningSonarConfig())
+    space: SpaceSonarConfig = setting(SpaceSonarConfig())
     drive: DriveConfig = setting(DriveConfig())
     instruments: InstrumentConfig = setting(InstrumentConfig())
     clutter: ClutterConfig = setting(ClutterConfig())
@@ -107,6 +112,8 @@ class MissionConfig(Config):
         """What the sonar sees in the end: angle [rad] and range [m]."""
         if self.is_turning:
             return 2.0 * math.pi, self.turning.max_range_m
+        if self.sonar_kind == "space":
+            return self.space.fov_rad, self.space.max_range_m
         return self.sonar.fov_rad, self.sonar.max_range_m
 
 
@@ -216,6 +223,7 @@ class PingMaker:
                 self._turning.append(sonar)
             else:
                 self._fans.append(SonarSimulator(world, config.sonar, run.range_scale))
+        self._space = SpaceSonarSimulator(world, config.space)
         self._clutter = MovingClutter(mission.world, mission.config.clutter)
 
     def ping(self, vehicle: int, index: int) -> SonarImage:
@@ -224,19 +232,7 @@ class PingMaker:
         motion, stamp_ns = run.ping_motion, int(run.ping_motion.stamp_ns[index])
         rng = np.random.default_rng([self._mission.config.seed, 20, vehicle, index])
         config = self._mission.config
-        turn = SE2()
-        if config.is_turning:
-            turn = SE2(yaw=beam_bearing_rad(config.turning, index))
-        if config.sway.is_level:
-            place, rotation = motion.pose(index) @ run.T_base_sonar @ turn, None
-        else:
-            T_level_fan, rotation = fan_in_space(
-                rotation_level_base(*config.sway.at(stamp_ns)[:2]),
-                run.T_base_sonar @ turn,
-                SONAR_HEIGHT_M,
-                config.sway.sonar_tilt_rad,
-            )
-            place = motion.pose(index) @ T_level_fan
+        place, rotation = self._place(vehicle, index)
         depth_m = float(motion.depth_m[index])
         clutter = self._clutter.at((stamp_ns - _START_NS) / _NS)
         intruder = self._intruder(vehicle, index, place)
@@ -245,6 +241,30 @@ class PingMaker:
                 stamp_ns, index, place, depth_m, rng, clutter, rotation, intruder
             )
         return self._fans[vehicle].ping(stamp_ns, place, depth_m, rng, clutter, rotation, intruder)
+
+    def space_ping(self, vehicle: int, index: int) -> SpacePing:
+        """Return the points of one ping of a sonar that hears in three dimensions."""
+        motion = self._mission.runs[vehicle].ping_motion
+        rng = np.random.default_rng([self._mission.config.seed, 20, vehicle, index])
+        place, rotation = self._place(vehicle, index)
+        stamp_ns, depth_m = int(motion.stamp_ns[index]), float(motion.depth_m[index])
+        return self._space.ping(stamp_ns, place, depth_m, rng, rotation)
+
+    def _place(self, vehicle: int, index: int) -> tuple[SE2, NDArray[np.float64] | None]:
+        """Where the sonar, or the beam of one that turns, is and looks; see `fan_in_space`."""
+        run, config = self._mission.runs[vehicle], self._mission.config
+        T_map_base, turn = run.ping_motion.pose(index), SE2()
+        if config.is_turning:
+            turn = SE2(yaw=beam_bearing_rad(config.turning, index))
+        if config.sway.is_level:
+            return T_map_base @ run.T_base_sonar @ turn, None
+        T_level_fan, rotation = fan_in_space(
+            rotation_level_base(*config.sway.at(int(run.ping_motion.stamp_ns[index]))[:2]),
+            run.T_base_sonar @ turn,
+            SONAR_HEIGHT_M,
+            config.sway.sonar_tilt_rad,
+        )
+        return T_map_base @ T_level_fan, rotation
 
     def _intruder(self, vehicle: int, index: int, T_map_fan: SE2) -> Intruder | None:
         """Another vehicle's ping: its sonar runs by itself, so that it comes at any time."""
@@ -262,10 +282,11 @@ class PingMaker:
         bearing_rad = math.atan2(seen.y, seen.x)
         return Intruder(bearing_rad, range_m, power_of_db(config.crosstalk_db))
 
-    def pings(self, vehicle: int, indices: range) -> Iterator[SonarImage]:
-        """Images of several pings of one vehicle."""
+    def pings(self, vehicle: int, indices: range) -> Iterator[SonarImage | SpacePing]:
+        """What several pings of one vehicle give."""
+        make = self.space_ping if self._mission.config.sonar_kind == "space" else self.ping
         for index in indices:
-            yield self.ping(vehicle, index)
+            yield make(vehicle, index)
 
 
 def every_metre(run: VehicleRun) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from uw_dslam_ros2.sim.mission import (
     Mission,
     VehicleRun,
 )
+from uw_dslam_ros2.sim.space_sonar import SpacePing
 from uw_dslam_ros2.sim.sway import body_rates, rotation_level_base
 from uw_dslam_ros2.sim.turning import counted_rad
 
@@ -61,6 +62,8 @@ class VehicleRecorder:
             is_cloud = self._config.turning.message == "points"
             kind = "PointCloud2" if is_cloud else "LaserScan"
             writer.add_topic(self._turning_topic, f"sensor_msgs/msg/{kind}")
+        elif self._config.sonar_kind == "space":
+            writer.add_topic(f"/{who}/sonar", "sensor_msgs/msg/PointCloud2")
         else:
             writer.add_topic(f"/{who}/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
         writer.add_topic(f"/{who}/imu", "sensor_msgs/msg/Imu")
@@ -84,8 +87,9 @@ class VehicleRecorder:
 
     def _mounts(self, stamp_ns: int) -> Any:
         who = self._run.vehicle_id
-        # A scan's axes are x ahead, y to port.
-        rotation = _NO_ROTATION if self._config.is_turning else _SONAR_ROTATION
+        # The axes of scans and points are x ahead, y to port.
+        is_imaging = self._config.sonar_kind == "imaging"
+        rotation = _SONAR_ROTATION if is_imaging else _NO_ROTATION
         if tilt_rad := self._config.sway.sonar_tilt_rad:
             rotation = _tilted(rotation, tilt_rad)
         mounts = [
@@ -102,8 +106,12 @@ class VehicleRecorder:
             stamp, kind, index = self._pending.pop()
             self._writers[kind](stamp, index)
 
-    def write_ping(self, image: SonarImage) -> None:
+    def write_ping(self, image: SonarImage | SpacePing) -> None:
         """Write one ping; of a sonar that turns, once its message is complete."""
+        if isinstance(image, SpacePing):
+            message = self._make.points(image.stamp_ns, self._sonar, image.points)
+            self._writer.write(f"/{self._run.vehicle_id}/sonar", image.stamp_ns, message)
+            return
         if not self._config.is_turning:
             self._write_image(image)
             return

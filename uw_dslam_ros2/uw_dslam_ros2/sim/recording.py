@@ -30,6 +30,7 @@ from uw_dslam_ros2.sim.mission import (
 )
 from uw_dslam_ros2.sim.raster import grid_over, seen_map
 from uw_dslam_ros2.sim.recorder import TRUTH_STEP, VehicleRecorder
+from uw_dslam_ros2.sim.space_sonar import SpacePing
 
 __all__ = ["RecordedMission", "read_mission", "simulate_mission"]
 
@@ -37,6 +38,7 @@ _CHUNK_PINGS = 40
 _CHUNK_BEAMS = 500
 _PARTIAL = ".partial"
 
+Ping = SonarImage | SpacePing
 Progress = Callable[[int, int], None]
 """Called with pings done and pings in all."""
 
@@ -125,7 +127,7 @@ def _record(
     _write_truth(folder / "truth", mission)
 
 
-ImageSource = Callable[[int, int], Iterator[SonarImage]]
+ImageSource = Callable[[int, int], Iterator[Ping]]
 
 
 class _ping_source:  # noqa: N801 - used like a function
@@ -156,7 +158,7 @@ class _ping_source:  # noqa: N801 - used like a function
             for vehicle, count in enumerate(run.num_pings for run in self._mission.runs)
         }
 
-        def images(vehicle: int, _count: int) -> Iterator[SonarImage]:
+        def images(vehicle: int, _count: int) -> Iterator[Ping]:
             futures = chunks.pop(vehicle)
             while futures:
                 yield from futures.pop(0).result()
@@ -176,7 +178,7 @@ def _start_worker(config: MissionConfig) -> None:
     _worker.append(PingMaker(plan_mission(config)))
 
 
-def _make_chunk(vehicle: int, start: int, stop: int) -> list[SonarImage]:
+def _make_chunk(vehicle: int, start: int, stop: int) -> list[Ping]:
     return list(_worker[0].pings(vehicle, range(start, stop)))
 
 
