@@ -10,12 +10,15 @@ import math
 import resource
 import sys
 import tracemalloc
+from collections.abc import Iterator
 
 import numpy as np
 from harness import Timing, emit, require, run_cases, timed
 
+from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue
-from uw_dslam_ros2.core.submap import SubmapId
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.sim.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
 
 _MAX_RMSE_M = 0.5  # one cell, for a hundred submaps
@@ -133,6 +136,56 @@ def memory(quick: bool) -> None:
     emit("memory", {"num_submaps": size**2, "grids": grids, "held": held, "peak": peak})
 
 
+def large(quick: bool) -> None:
+    """An L of two arms at 0.05 m: memory by what was seen; what is too far away is left out."""
+    for arm_m in (200.0,) if quick else (950.0, 2000.0):
+        tracemalloc.start()
+        queue = MapQueue()
+        for submap in _along_an_l(arm_m):
+            queue.add_submap(submap)
+        changed = queue.changed_window()
+        held, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        require(changed is not None, "nothing was drawn")
+        records = queue.submaps()
+        left_out = [record for record in records if "not drawn" in record.reason]
+        emit(
+            "large",
+            {
+                "arm_m": arm_m,
+                "num_submaps": len(records),
+                "num_left_out": len(left_out),
+                "num_kept": len(queue.to_state().submaps),
+                "map_cells": math.prod(changed[0].shape) if changed else 0,
+                "grids_mb": sum(r.submap.grid.values.nbytes for r in records) * 1e-6,
+                "held_mb": held * 1e-6,
+            },
+        )
+        require(bool(left_out) == (arm_m > 1000.0), f"{len(left_out)} left out")
+
+
+def _along_an_l(arm_m: float) -> Iterator[Submap]:
+    """Round views of 30 m, every 20 m, along two arms."""
+    num_cells, step_m = 600, 20.0
+    center = np.hypot(*np.mgrid[-299.5:300, -299.5:300]) < 300.0
+    values = np.where(center, FREE, UNKNOWN).astype(np.int8)
+    values[280, 100:500] = OCCUPIED
+    grid = OccupancyMap(GridSpec(0.05, num_cells, num_cells, SE2(-15.0, -15.0)), values)
+    steps = np.arange(0.0, arm_m, step_m)
+    way = [SE2(x, 0.0, 0.0) for x in steps] + [SE2(arm_m, y, 0.5 * math.pi) for y in steps]
+    for number, pose in enumerate(way):
+        yield Submap(
+            vehicle_id="auv_1",
+            sequence=number,
+            revision=0,
+            is_final=True,
+            stamp_ns=number + 1,
+            T_odom_submap=pose,
+            covariance=np.diag([1e-4, 1e-4, 1e-6]),
+            grid=OccupancyMap(grid.spec, values.copy()),
+        )
+
+
 def _settled(fleet: Fleet) -> tuple[MapQueue, int]:
     queue = MapQueue()
     for submap_id in sorted(fleet.submaps):
@@ -166,5 +219,11 @@ def _slope(numbers: list[int], values: list[float]) -> float:
 
 
 if __name__ == "__main__":
-    cases = {"batch": batch, "incremental": incremental, "fleets": fleets, "memory": memory}
+    cases = {
+        "batch": batch,
+        "incremental": incremental,
+        "fleets": fleets,
+        "memory": memory,
+        "large": large,
+    }
     sys.exit(run_cases(__doc__ or "", cases))
