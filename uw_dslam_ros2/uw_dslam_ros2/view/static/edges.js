@@ -6,7 +6,7 @@ const KINDS = [
   { fits: (edge) => edge.kind === "confirmed", words: "confirmed by a person", line: { color: "#5b2a86", weight: 4, dashArray: "12 4 2 4" } },
   { fits: (edge) => !edge.is_inlier, words: "taken out: it contradicts the others", line: { color: "#cc2800", weight: 2, dashArray: "2 5" } },
   { fits: (edge) => edge.is_unsure, words: "refused by itself, believed because others agree", line: { color: "#8a6d00", weight: 2.5, dashArray: "8 4" } },
-  { fits: (edge) => edge.residual_m > GOOD_M, words: `holds, but pulls: more than ${GOOD_M} m left`, line: { color: "#d55e00", weight: 2.5 } },
+  { fits: (edge) => edge.residual_m > GOOD_M, words: `holds, but pulls (over ${GOOD_M} m)`, line: { color: "#d55e00", weight: 2.5 } },
   { fits: () => true, words: "holds", line: { color: "#00704f", weight: 2.5 } },
 ];
 

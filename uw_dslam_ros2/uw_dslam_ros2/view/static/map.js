@@ -67,9 +67,9 @@ export class MapView {
       mark.addTo(this.groups.constraints);
     }
     for (const group of scene.groups.length > 1 ? scene.groups : []) {
-      const [x0, , x1, y1] = group.bounds;
-      const icon = L.divIcon({ className: "map-note", iconSize: null, html: text(`${group.frame}: ${group.vehicles.join(", ")}`) });
-      L.marker([y1, (x0 + x1) / 2], { interactive: false, keyboard: false, icon }).addTo(this.groups.names);
+      const [x0, , , y1] = group.bounds;
+      const icon = L.divIcon({ className: "map-note group-name", iconSize: null, iconAnchor: [0, 26], html: text(`${group.frame}: ${group.vehicles.join(", ")}`) });
+      L.marker([y1, x0], { interactive: false, keyboard: false, icon }).addTo(this.groups.names);
     }
     if (!this.isFitted && scene.groups.length) {
       const seen = scene.submaps.flatMap((submap) => submap.outline);
