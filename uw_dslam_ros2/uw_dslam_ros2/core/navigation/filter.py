@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.navigation.config import NavigationConfig
+from uw_dslam_ros2.core.navigation.doubt import are_alike, doubted
 from uw_dslam_ros2.core.navigation.kernels import NUM_STATES, gated_update, predict
 from uw_dslam_ros2.core.navigation.measurements import (
     Clone,
@@ -34,8 +35,6 @@ _WAIT_FOR_YAW_NS = 1_000_000_000
 _UNKNOWN_HEADING_RAD = math.pi
 _UNSURE_M_S = 0.3
 """A velocity known no better passes nearly everything: then two measurements have to agree."""
-_AGREE_S = 2.0
-"""However long apart, two velocities agree only if they could have followed so soon."""
 
 _Key = tuple[int, int, tuple[float, ...]]
 """Stamp, order of the kind, content: equal only for equal messages."""
@@ -327,7 +326,10 @@ class NavigationFilter:
             return state, covariance, refused
         kind = type(event)
         gate = (self._config.gate_sigma**2) * (1.0 + 0.5 * (len(innovation) - 1))
-        agrees = isinstance(event, Velocity) and self._agrees(stamp_ns, event, before, gate)
+        walk_m_s = self._config.velocity_walk_m_s
+        agrees = isinstance(event, Velocity) and are_alike(
+            before.said, stamp_ns, event, walk_m_s, gate
+        )
         is_unsure = max(covariance[3, 3], covariance[4, 4]) > _UNSURE_M_S**2
         if isinstance(event, Velocity) and is_unsure and not agrees:
             return state, covariance, refused
@@ -346,24 +348,12 @@ class NavigationFilter:
         # The filter itself must be wrong by now.
         kept = {k: v for k, v in refused.items() if k is not kind}
         if agrees:  # and has gone the wrong way all the time
-            covariance = _doubted(state, covariance, jac, innovation, (stamp_ns - since_ns) * 1e-9)
+            covariance = doubted(state, covariance, jac, innovation, (stamp_ns - since_ns) * 1e-9)
             return *gated_update(state, covariance, innovation, jac, noise, -1.0)[:2], kept
         # Take the measurement, but no better than it fits.
         wide = noise + np.outer(innovation, innovation)
         new_state, new_covariance, _ = gated_update(state, covariance, innovation, jac, wide, -1.0)
         return new_state, new_covariance, kept
-
-    def _agrees(self, stamp_ns: int, event: Velocity, before: _Record, gate: float) -> bool:
-        """Whether a vehicle could have come to this velocity from the one measured before."""
-        if before.said is None:
-            return False
-        said_ns, said_m_s = before.said
-        rotation = event.T_base_sensor.rotation()
-        walk_s = min((stamp_ns - said_ns) * 1e-9, _AGREE_S)
-        spread = 2.0 * rotation @ event.noise @ rotation.T
-        spread += np.eye(2) * self._config.velocity_walk_m_s**2 * walk_s
-        change = rotation @ event.velocity_m_s - said_m_s
-        return bool(change @ np.linalg.solve(spread, change) <= gate)
 
     def _predicted(self, record: _Record, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         dt_s = (stamp_ns - record.key[0]) * 1e-9
@@ -386,20 +376,3 @@ class NavigationFilter:
         # In steps, so that the list is not moved for every message.
         if position > 64:
             del self._records[: position - 1]
-
-
-def _doubted(
-    state: FloatArray,
-    covariance: FloatArray,
-    jac: FloatArray,
-    innovation: FloatArray,
-    for_s: float,
-) -> FloatArray:
-    """Covariance of a filter whose velocity has been wrong by an innovation (2,) for some time."""
-    wrong = jac[:, 3:5].T @ innovation
-    cos, sin = math.cos(state[2]), math.sin(state[2])
-    way = for_s * np.array([cos * wrong[0] - sin * wrong[1], sin * wrong[0] + cos * wrong[1]])
-    error = np.zeros(NUM_STATES)
-    error[:2], error[3:5] = way, wrong
-    widened: FloatArray = covariance + np.outer(error, error)
-    return widened
