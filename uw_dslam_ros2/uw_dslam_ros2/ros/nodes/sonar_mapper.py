@@ -369,8 +369,8 @@ class SonarMapper(ManagedNode):
         self._mapper_values = self._runs.diagnostics()
         return (
             f"{self._mapper_values['num_pings']} pings mapped into "
-            f"{self._mapper_values['num_submaps']} submaps; {self._counts['num_bad']} bad messages"
-            f"; {len(drawn_anew)} submaps drawn anew"
+            f"{self._mapper_values['num_submaps']} submaps, {len(drawn_anew)} of them drawn anew; "
+            f"{self._counts['num_bad']} bad messages"
         )
 
     def _close_last(self) -> None:
