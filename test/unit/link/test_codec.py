@@ -55,6 +55,18 @@ def test_an_outline_stays_small_far_away():
     assert len(encode_submap(far)[Layer.OUTLINE]) <= 56
 
 
+@pytest.mark.parametrize("layer", [Layer.COARSE, Layer.FINE])
+def test_walls_with_no_free_water_near_are_sent_too(layer):
+    spec, values = GridSpec(0.1, 120, 120), np.full((120, 120), -1, np.int8)
+    values[12:48, 12:48] = 0
+    values[81:84, 30:90] = 100  # three metres from what is free
+    layers = encode_submap(submap(grid=OccupancyMap(spec, values)))
+    got = received(layer, layers=layers).submap("auv_1").grid
+    walls = got.spec.centers_of(np.argwhere(got.values > 50))
+    assert walls.min(axis=0) == pytest.approx([3.0, 8.1], abs=0.2)
+    assert walls.max(axis=0) == pytest.approx([9.0, 8.4], abs=0.2)
+
+
 @pytest.mark.parametrize(("layer", "resolution_m"), [(Layer.COARSE, 0.3), (Layer.FINE, 0.1)])
 def test_each_layer_shows_the_same_place(layer, resolution_m):
     got = received(layer).submap("auv_1")

@@ -161,13 +161,16 @@ class Outbox:
             return max(1, item.parts)
         if item.num_sent >= _MOST_TIMES * item.parts:
             return 0
-        # The first time, whoever hears it: as many as a listener is likely to need.
-        left = math.floor(item.parts / (1.0 - min(self.loss, _LOSS_LIMIT))) - item.num_sent
+        left = item.parts - item.num_sent  # the first time, whoever hears it
         for peer in peers:
-            if (heard := item.peers.get(peer)) is None:
+            heard = item.peers.get(peer)
+            if heard is None or heard[1] == 0:
+                # It has said nothing of it yet: as many as it is likely to need.
+                likely = math.floor(item.parts / (1.0 - min(self.loss, _LOSS_LIMIT)))
+                left = max(left, likely - item.num_sent)
                 continue
             lacking, mark = heard
-            if lacking and mark:
+            if lacking:
                 wanted = math.floor(lacking / (1.0 - min(self.loss, _LOSS_LIMIT)) + 0.5)
                 if self.loss > _SPARE_LOSS:
                     wanted += spare
