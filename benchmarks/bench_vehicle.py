@@ -18,14 +18,10 @@ from typing import Any
 import numpy as np
 from harness import emit, require, run_cases
 
-from uw_dslam_ros2.core.mapping import (
-    VehicleMapper,
-    VehicleMapperConfig,
-    estimators,
-    local_map,
-    section,
-)
+from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig, section
 from uw_dslam_ros2.core.mapping import vehicle_mapper as mapper_module
+from uw_dslam_ros2.core.mapping.loops.closures import estimators
+from uw_dslam_ros2.core.mapping.scans import local_map
 from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.core.sonar import SonarImage
 from uw_dslam_ros2.io.drivers.projected_image import read_projected

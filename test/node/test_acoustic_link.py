@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.link import Layer
 from uw_dslam_ros2.core.link.transport.packets import Packet
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.io.link_state import load_link_state
+from uw_dslam_ros2.io.sessions.link_state import load_link_state
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_to_msg
 from uw_dslam_ros2.ros.nodes.acoustic_link import AcousticLinkNode
 from uw_dslam_ros2.ros.nodes.channel import ChannelNode

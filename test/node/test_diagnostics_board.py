@@ -6,7 +6,7 @@ pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from uw_dslam_ros2.ros.plumbing.diagnostics_board import DiagnosticsBoard
+from uw_dslam_ros2.ros.manager.diagnostics_board import DiagnosticsBoard
 
 pytestmark = pytest.mark.ros
 

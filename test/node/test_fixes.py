@@ -22,8 +22,8 @@ from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.fixes import FixLog
 from uw_dslam_ros2.io.readings import FixEvent
 from uw_dslam_ros2.ros.convert.core_types import transform2d_from_msg
+from uw_dslam_ros2.ros.manager import fix_inputs
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
-from uw_dslam_ros2.ros.plumbing import fix_inputs
 from uw_dslam_ros2.ros.plumbing.qos import sensor_qos
 
 pytestmark = pytest.mark.ros

@@ -24,7 +24,7 @@ from uw_dslam_msgs.srv import RegisterMaps
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
-from uw_dslam_ros2.io.session import load_session
+from uw_dslam_ros2.io.sessions.session import load_session
 from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg, submap_to_msg
 from uw_dslam_ros2.ros.nodes import registration_server
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager

@@ -27,9 +27,9 @@ from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_to_msg,
     submap_to_msg,
 )
+from uw_dslam_ros2.ros.manager.map_inputs import vehicle_of
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
-from uw_dslam_ros2.ros.plumbing.map_inputs import vehicle_of
 from uw_dslam_ros2.ros.plumbing.qos import LATCHED, SUBMAPS
 
 pytestmark = pytest.mark.ros

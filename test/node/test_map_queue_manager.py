@@ -34,17 +34,17 @@ from visualization_msgs.msg import MarkerArray
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.maps import read_map
-from uw_dslam_ros2.io.provenance import read_provenance
-from uw_dslam_ros2.io.session import SessionInUseError, has_session, load_session
+from uw_dslam_ros2.io.maps.files import read_map
+from uw_dslam_ros2.io.maps.provenance import read_provenance
+from uw_dslam_ros2.io.sessions.session import SessionInUseError, has_session, load_session
 from uw_dslam_ros2.ros.convert.core_types import (
     occupancy_from_msg,
     submap_from_msg,
     submap_to_msg,
 )
+from uw_dslam_ros2.ros.manager import missing_submaps
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.nodes.registration_server import RegistrationServer
-from uw_dslam_ros2.ros.plumbing import missing_submaps
 from uw_dslam_ros2.ros.plumbing.qos import LATCHED, SUBMAPS
 
 pytestmark = pytest.mark.ros

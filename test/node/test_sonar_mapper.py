@@ -19,7 +19,7 @@ from uw_dslam_msgs.srv import GetSubmap
 from uw_dslam_ros2.core.errors import ConfigError
 from uw_dslam_ros2.io.messages import stamp_of
 from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, stamp_to_msg, submap_from_msg
-from uw_dslam_ros2.ros.plumbing import sensor_silence
+from uw_dslam_ros2.ros.mapper import sensor_silence
 from uw_dslam_ros2.ros.plumbing.qos import STATIC_TF
 
 pytestmark = pytest.mark.ros

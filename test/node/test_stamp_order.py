@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from uw_dslam_ros2.ros.plumbing.stamp_order import StampOrder
+from uw_dslam_ros2.ros.mapper.stamp_order import StampOrder
 
 pytestmark = pytest.mark.ros
 

@@ -17,7 +17,7 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.cli.processes import Children
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.session import load_session
+from uw_dslam_ros2.io.sessions.session import load_session
 from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]

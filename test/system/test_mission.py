@@ -25,7 +25,7 @@ from uw_dslam_msgs.srv import SaveMap, SaveSession
 
 from uw_dslam_ros2.cli.processes import Children
 from uw_dslam_ros2.core.metrics import compare_maps, trajectory_error
-from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.trajectories import read_tum
 from uw_dslam_ros2.sim.mission import tiny_mission_config
 from uw_dslam_ros2.sim.recording import simulate_mission

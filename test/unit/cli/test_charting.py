@@ -12,7 +12,7 @@ from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart
 from uw_dslam_ros2.core.chart.pings import pack_ping
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.metrics import map_sharpness
 from uw_dslam_ros2.core.se2 import SE2

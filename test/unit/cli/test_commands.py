@@ -16,7 +16,7 @@ from uw_dslam_ros2.cli.outcome import write_outcome
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration import Verdict
-from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.maps.files import write_map
 from uw_dslam_ros2.io.trajectories import write_tum
 
 COMMANDS = (

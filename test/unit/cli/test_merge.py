@@ -16,8 +16,8 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MatchRequest
 from uw_dslam_ros2.core.registration import Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.maps import read_map, write_map
-from uw_dslam_ros2.io.provenance import read_provenance
+from uw_dslam_ros2.io.maps.files import read_map, write_map
+from uw_dslam_ros2.io.maps.provenance import read_provenance
 
 # Where the maps' frames lie in the world: far away and turned, as UTM and other programs have it.
 T_WORLD_MAP = {

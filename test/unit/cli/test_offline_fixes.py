@@ -12,7 +12,7 @@ from uw_dslam_ros2.core.merging import Decision, DecisionKind
 from uw_dslam_ros2.core.metrics import interpolate_poses
 from uw_dslam_ros2.io.bags import BagWriter, open_bag
 from uw_dslam_ros2.io.earth import utm_position
-from uw_dslam_ros2.io.session import Session, load_session
+from uw_dslam_ros2.io.sessions.session import Session, load_session
 from uw_dslam_ros2.io.trajectories import read_tum
 from uw_dslam_ros2.sim.mission import tiny_mission_config
 from uw_dslam_ros2.sim.recording import simulate_mission

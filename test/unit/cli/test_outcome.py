@@ -20,8 +20,8 @@ from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.io.maps import read_map
-from uw_dslam_ros2.io.session import load_session, save_session
+from uw_dslam_ros2.io.maps.files import read_map
+from uw_dslam_ros2.io.sessions.session import load_session, save_session
 from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
 
 

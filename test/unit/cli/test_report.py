@@ -22,7 +22,7 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import Decision, DecisionKind
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.io.maps import read_map, write_map
+from uw_dslam_ros2.io.maps.files import read_map, write_map
 from uw_dslam_ros2.io.trajectories import write_tum
 from uw_dslam_ros2.view.queue_source import QueueSource
 

@@ -17,7 +17,7 @@ from uw_dslam_ros2.cli.study import build_parser, main, study_names
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.maps.files import write_map
 from uw_dslam_ros2.sim.floor_plans import make_place
 from uw_dslam_ros2.sim.map_pairs import make_pair, observe
 

@@ -9,7 +9,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import Decision, DecisionKind
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.io.decisions import decision_from_plain, decision_to_plain
+from uw_dslam_ros2.io.sessions.decisions import decision_from_plain, decision_to_plain
 
 ONE, OTHER = SubmapId("auv_1", 0, 3), SubmapId("b<c>", 7, 0)
 DECISIONS = [

@@ -13,7 +13,7 @@ from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.earth import utm_position
 from uw_dslam_ros2.io.fixes import FixLog, fixes_of_recordings
 from uw_dslam_ros2.io.readings import FixEvent
-from uw_dslam_ros2.io.session import load_session, save_session
+from uw_dslam_ros2.io.sessions.session import load_session, save_session
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

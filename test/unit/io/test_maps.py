@@ -12,7 +12,7 @@ import yaml
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.maps import image_of, read_map, write_map
+from uw_dslam_ros2.io.maps.files import image_of, read_map, write_map
 
 # Three rows (lowest y first), four columns; asymmetric under every flip and turn.
 VALUES = np.array([[0, 100, -1, -1], [100, 100, 0, 0], [-1, 0, 0, 100]], dtype=np.int8)

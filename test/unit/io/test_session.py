@@ -16,10 +16,10 @@ from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import Decision, DecisionKind, MapQueue, SubmapState
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.io.maps import read_map
-from uw_dslam_ros2.io.session import SESSION_FILE, load_session, save_session
-from uw_dslam_ros2.io.session_export import export_queue
-from uw_dslam_ros2.io.session_file import Record, opened, read_records, write_records
+from uw_dslam_ros2.io.maps.files import read_map
+from uw_dslam_ros2.io.sessions.session import SESSION_FILE, load_session, save_session
+from uw_dslam_ros2.io.sessions.session_export import export_queue
+from uw_dslam_ros2.io.sessions.session_file import Record, opened, read_records, write_records
 from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
 
@@ -184,7 +184,7 @@ _SAVE_FOR_EVER = """
 import sys
 from unit.merging.fleet import three_vehicles
 from uw_dslam_ros2.core.merging import MapQueue
-from uw_dslam_ros2.io.session import save_session
+from uw_dslam_ros2.io.sessions.session import save_session
 fleet = three_vehicles()
 queue = MapQueue()
 for submap_id in sorted(fleet.submaps):

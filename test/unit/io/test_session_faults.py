@@ -13,8 +13,8 @@ from unit.io.test_session import FLEET, contents, filled, save_fails_at
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import MapQueue
-from uw_dslam_ros2.io.array_files import arrays_from_bytes, arrays_to_bytes
-from uw_dslam_ros2.io.session import (
+from uw_dslam_ros2.io.sessions.array_files import arrays_from_bytes, arrays_to_bytes
+from uw_dslam_ros2.io.sessions.session import (
     GOOD_FILE,
     SESSION_FILE,
     Session,
@@ -23,7 +23,7 @@ from uw_dslam_ros2.io.session import (
     load_session,
     save_session,
 )
-from uw_dslam_ros2.io.session_export import export_queue
+from uw_dslam_ros2.io.sessions.session_export import export_queue
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
 
 DATA = Path(__file__).parent / "data"
@@ -207,7 +207,7 @@ def test_a_bomb_is_refused_before_memory_is_taken():
 
 def test_a_submap_larger_than_the_limit_is_refused_from_a_session(tmp_path, monkeypatch):
     save_session(tmp_path, filled())
-    monkeypatch.setattr("uw_dslam_ros2.io.session._EXTRA_BYTES", -15_999_000)
+    monkeypatch.setattr("uw_dslam_ros2.io.sessions.session._EXTRA_BYTES", -15_999_000)
     with pytest.raises(DataError, match="expected at most 1000"):
         load_session(tmp_path)
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from uw_dslam_ros2.core.chart.lines import Pier, Wall
-from uw_dslam_ros2.io.wall_files import dxf_bytes, walls_geojson_bytes
+from uw_dslam_ros2.io.maps.walls import dxf_bytes, walls_geojson_bytes
 
 WALLS = [
     Wall(np.array([[0.0, 0.0], [10.0, 0.5], [12.0, 4.0]]), 0.25, 1_700_000_000_500_000_000),

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.mapping import VehicleMapperConfig, loop_verdict
+from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.config import LoopRegistrationConfig
-from uw_dslam_ros2.core.mapping.loop_verdict import _RULES
-from uw_dslam_ros2.core.mapping.matcher import ScanMatch
+from uw_dslam_ros2.core.mapping.loops.closures import verdict as loop_verdict
+from uw_dslam_ros2.core.mapping.loops.verdict import _RULES
+from uw_dslam_ros2.core.mapping.scans.matcher import ScanMatch
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.registration.rules import first_that_applies
 from uw_dslam_ros2.core.se2 import SE2

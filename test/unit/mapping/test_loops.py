@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.mapping import OccupancyConfig, VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.graph import SubmapGraph
-from uw_dslam_ros2.core.mapping.loop_verdict import decide_loop
-from uw_dslam_ros2.core.mapping.matcher import Prior
-from uw_dslam_ros2.core.mapping.rivals import without_direction
+from uw_dslam_ros2.core.mapping.loops.graph import SubmapGraph
+from uw_dslam_ros2.core.mapping.loops.rivals import without_direction
+from uw_dslam_ros2.core.mapping.loops.verdict import decide_loop
+from uw_dslam_ros2.core.mapping.scans.matcher import Prior
 from uw_dslam_ros2.core.mapping.section import OpenSection
 from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.mapping.match_kernels import score_poses, score_window
-from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
+from uw_dslam_ros2.core.mapping.scans.match_kernels import score_poses, score_window
+from uw_dslam_ros2.core.mapping.scans.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.se2 import SE2
 
 pytestmark = pytest.mark.kernels

@@ -7,7 +7,7 @@ import numpy as np
 
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.config import MatchConfig, SubmapConfig
-from uw_dslam_ros2.core.mapping.local_map import LocalMap
+from uw_dslam_ros2.core.mapping.scans.local_map import LocalMap
 from uw_dslam_ros2.core.se2 import SE2
 
 _S = 1_000_000_000

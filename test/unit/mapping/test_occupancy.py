@@ -8,8 +8,8 @@ import pytest
 
 from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNITS_PER_NAT, GridSpec
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.grid_kernels import beam_table, diamond
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.drawing.grid_kernels import beam_table, diamond
+from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
 from uw_dslam_ros2.core.mapping.section import ClosedSection
 from uw_dslam_ros2.core.mapping.vehicle_map import VehicleMap
 from uw_dslam_ros2.core.mosaic import fuse_maps

@@ -8,7 +8,7 @@ import pytest
 
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.config import ParticleConfig
-from uw_dslam_ros2.core.mapping.particles import ParticleFilter, _proposal
+from uw_dslam_ros2.core.mapping.loops.particles import ParticleFilter, _proposal
 from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2
 

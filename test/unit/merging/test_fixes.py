@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.merging.georeference import Fix, pulled_by_fixes
+from uw_dslam_ros2.core.merging.steering.georeference import Fix, pulled_by_fixes
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId

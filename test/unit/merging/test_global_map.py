@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.merging.global_map import snap_pose
+from uw_dslam_ros2.core.merging.drawn.global_map import snap_pose
 from uw_dslam_ros2.core.se2 import SE2
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.merging.checks.places import meetings, pose_uncertainty, vague_places
-from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, shared_area_m2
+from uw_dslam_ros2.core.merging.steering.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.pose_graph import chained_covariance, invert_covariance
 from uw_dslam_ros2.core.se2 import SE2

@@ -13,13 +13,13 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
 from uw_dslam_ros2.core.merging import planning as planning_module
 from uw_dslam_ros2.core.merging.checks.soundness import contested_track, contradicting_track
-from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
 from uw_dslam_ros2.core.merging.graph.components import Constraint
 from uw_dslam_ros2.core.merging.graph.constraints import constraint_of
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapGroup
+from uw_dslam_ros2.core.merging.steering.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2

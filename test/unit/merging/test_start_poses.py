@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import ConfigError
-from uw_dslam_ros2.core.merging.start_poses import StartPoses
+from uw_dslam_ros2.core.merging.steering.start_poses import StartPoses
 from uw_dslam_ros2.core.se2 import SE2
 
 TEXTS = ["robot1 2.5 -1.0 1.57", "fleet/robot2 0 40 -0.5"]

@@ -17,8 +17,8 @@ from uw_dslam_ros2.core.merging import (
     MapQueue,
     MapQueueConfig,
 )
-from uw_dslam_ros2.core.merging.decision_bytes import read_decision, write_decision
-from uw_dslam_ros2.core.merging.told_decisions import ToldDecisions
+from uw_dslam_ros2.core.merging.steering.decision_bytes import read_decision, write_decision
+from uw_dslam_ros2.core.merging.steering.told_decisions import ToldDecisions
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all

@@ -8,7 +8,7 @@ import pytest
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.mounting import StaticFrames, fan_mount
 from uw_dslam_ros2.io.bags import ImageEvent, ImuEvent, TransformEvent, TruthEvent, read_events
-from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.trajectories import read_tum
 from uw_dslam_ros2.sim.mission import (
     T_BASE_DVL,

@@ -20,7 +20,12 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import Decision, DecisionKind, MapQueue
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.io.session import Session, SessionInUseError, load_session, save_session
+from uw_dslam_ros2.io.sessions.session import (
+    Session,
+    SessionInUseError,
+    load_session,
+    save_session,
+)
 from uw_dslam_ros2.view import registering
 from uw_dslam_ros2.view.export import export_zip
 from uw_dslam_ros2.view.laying import lay_out, run_map

@@ -14,7 +14,7 @@ from unit.cli import missions
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import MapQueue
-from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
 from uw_dslam_ros2.view.guard import is_loopback
 from uw_dslam_ros2.view.queue_source import QueueSource

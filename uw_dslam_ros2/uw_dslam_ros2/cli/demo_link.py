@@ -13,7 +13,7 @@ from typing import Any
 from uw_dslam_ros2.cli.processes import Child, Children, free_domain
 from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig
 from uw_dslam_ros2.core.merging import SubmapState
-from uw_dslam_ros2.io.session import SESSION_FOLDER
+from uw_dslam_ros2.io.sessions.session import SESSION_FOLDER
 
 __all__ = ["DEFAULT_LINK_RATE", "LINK_PRESETS", "LinkedMission", "run_linked"]
 

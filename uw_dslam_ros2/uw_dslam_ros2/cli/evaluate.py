@@ -14,7 +14,7 @@ from uw_dslam_ros2.cli.report import whose_error
 from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M, Scores, Truth, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.metrics import trajectory_error
-from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.trajectories import read_tum
 
 __all__ = ["main"]

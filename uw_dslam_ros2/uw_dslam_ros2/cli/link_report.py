@@ -14,7 +14,7 @@ from uw_dslam_ros2.cli.map_drawing import INK, VEHICLE_COLORS, blank_figure
 from uw_dslam_ros2.cli.scoring import Truth
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
 from uw_dslam_ros2.core.metrics import trajectory_error
-from uw_dslam_ros2.io.session import load_session
+from uw_dslam_ros2.io.sessions.session import load_session
 
 __all__ = ["add_maps", "known_over_time"]
 

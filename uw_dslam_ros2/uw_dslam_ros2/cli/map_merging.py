@@ -20,7 +20,7 @@ from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.merging import MapProvenance, MapQueue, MapQueueConfig, SubmapRecord
-from uw_dslam_ros2.core.merging.global_map import pinned_lattice
+from uw_dslam_ros2.core.merging.drawn.global_map import pinned_lattice
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query
 from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.pose_graph import compose_covariance, invert_covariance
@@ -31,7 +31,7 @@ from uw_dslam_ros2.core.registration import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.io.map_image import MAX_SIDE
+from uw_dslam_ros2.io.maps.image import MAX_SIDE
 
 __all__ = ["MapFile", "MergedMaps", "Placement", "Settler", "VerdictRow", "merge_maps", "told"]
 

@@ -26,8 +26,8 @@ from uw_dslam_ros2.cli.mapping import OfflineConfig
 from uw_dslam_ros2.cli.outcome import json_bytes
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.io.atomic import write_files
-from uw_dslam_ros2.io.maps import read_map, write_map
-from uw_dslam_ros2.io.provenance import write_provenance
+from uw_dslam_ros2.io.maps.files import read_map, write_map
+from uw_dslam_ros2.io.maps.provenance import write_provenance
 
 __all__ = [
     "EXIT_APART",

@@ -23,7 +23,12 @@ from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.merging import Decision, Georeference, MapQueue
 from uw_dslam_ros2.io.fixes import fixes_of_recordings
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
-from uw_dslam_ros2.io.session import SESSION_FOLDER, load_session, save_session, session_of
+from uw_dslam_ros2.io.sessions.session import (
+    SESSION_FOLDER,
+    load_session,
+    save_session,
+    session_of,
+)
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import find_recordings
 

@@ -32,9 +32,9 @@ from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.earth import geotiff_bytes
-from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.maps.files import write_map
+from uw_dslam_ros2.io.maps.provenance import write_provenance
 from uw_dslam_ros2.io.pose_graphs import pose_graph_bytes
-from uw_dslam_ros2.io.provenance import write_provenance
 from uw_dslam_ros2.io.trajectories import write_tum
 from uw_dslam_ros2.view.pairs import Pair
 

@@ -24,7 +24,7 @@ from uw_dslam_ros2.core.registration import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.atomic import write_files
-from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.settings import SettingsFile
 
 __all__ = ["EXIT_CODES", "main"]

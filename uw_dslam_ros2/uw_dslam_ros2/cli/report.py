@@ -21,8 +21,8 @@ from uw_dslam_ros2.cli.wall_lines import walls_of, walls_picture
 from uw_dslam_ros2.core.merging import Georeference
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
-from uw_dslam_ros2.io.provenance import contradictions_png
-from uw_dslam_ros2.io.wall_files import dxf_bytes, walls_geojson_bytes
+from uw_dslam_ros2.io.maps.provenance import contradictions_png
+from uw_dslam_ros2.io.maps.walls import dxf_bytes, walls_geojson_bytes
 from uw_dslam_ros2.view.pairs import KEY
 
 __all__ = ["RunFacts", "headline", "whose_error", "write_report"]

@@ -18,7 +18,7 @@ from uw_dslam_ros2.core.metrics import (
     map_sharpness,
     trajectory_error,
 )
-from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.trajectories import read_tum
 
 __all__ = ["Scores", "Truth", "read_truth", "score"]

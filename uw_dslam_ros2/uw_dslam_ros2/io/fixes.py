@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from uw_dslam_ros2.core.merging import Fix
-from uw_dslam_ros2.core.merging.track_fixes import fixes_along
+from uw_dslam_ros2.core.merging.steering.track_fixes import fixes_along
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.earth import utm_frame, utm_position
 from uw_dslam_ros2.io.readings import FixEvent

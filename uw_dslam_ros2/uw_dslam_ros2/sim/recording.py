@@ -16,7 +16,7 @@ import numpy as np
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import OCCUPIED, OccupancyMap
 from uw_dslam_ros2.core.sonar.types import SonarImage
-from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.maps.files import write_map
 from uw_dslam_ros2.io.recordings import BagWriter
 from uw_dslam_ros2.io.trajectories import write_tum
 from uw_dslam_ros2.sim.mission import (

@@ -6,7 +6,7 @@ from collections.abc import Hashable, Mapping
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
-from uw_dslam_ros2.core.merging.global_map import GlobalMap, pinned_lattice
+from uw_dslam_ros2.core.merging.drawn.global_map import GlobalMap, pinned_lattice
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId

@@ -16,10 +16,10 @@ from uw_dslam_ros2.core.chart.lines import trace_walls
 from uw_dslam_ros2.core.merging import DecisionKind, SubmapRecord, SubmapState, last_seen_ns
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.earth import geotiff_bytes, projection_bytes, world_file_bytes
-from uw_dslam_ros2.io.maps import write_map
+from uw_dslam_ros2.io.maps.files import write_map
+from uw_dslam_ros2.io.maps.walls import dxf_bytes, walls_geojson_bytes
 from uw_dslam_ros2.io.pose_graphs import pose_graph_bytes
 from uw_dslam_ros2.io.trajectories import tum_bytes
-from uw_dslam_ros2.io.wall_files import dxf_bytes, walls_geojson_bytes
 from uw_dslam_ros2.view.overview import Names
 from uw_dslam_ros2.view.showing import Showing
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from uw_dslam_ros2.core.errors import DataError, UwDslamError
 from uw_dslam_ros2.core.merging import Decision, MapQueue
-from uw_dslam_ros2.io.session import Session
+from uw_dslam_ros2.io.sessions.session import Session
 from uw_dslam_ros2.view import registering
 from uw_dslam_ros2.view.showing import Showing
 

@@ -16,7 +16,7 @@ from typing import Any
 from aiohttp import web
 
 from uw_dslam_ros2.core.errors import InvalidInputError, UwDslamError
-from uw_dslam_ros2.io.decisions import decision_from_plain
+from uw_dslam_ros2.io.sessions.decisions import decision_from_plain
 from uw_dslam_ros2.view.export import export_zip
 from uw_dslam_ros2.view.guard import HEADERS, Guard
 from uw_dslam_ros2.view.laying import lay_out, run_map

@@ -12,8 +12,8 @@ from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recording
 from uw_dslam_ros2.cli.scoring import Truth, read_truth
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.io.maps import write_map
-from uw_dslam_ros2.io.session import load_session, save_session
+from uw_dslam_ros2.io.maps.files import write_map
+from uw_dslam_ros2.io.sessions.session import load_session, save_session
 from uw_dslam_ros2.io.trajectories import write_tum
 from uw_dslam_ros2.io.vehicles import recordings_of
 from uw_dslam_ros2.sim.mission import MissionConfig

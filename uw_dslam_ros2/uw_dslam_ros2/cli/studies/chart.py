@@ -28,14 +28,14 @@ from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import UNITS_PER_NAT, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.log_odds_grid import LogOddsGrid
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.drawing.log_odds_grid import LogOddsGrid
+from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.metrics import compare_maps, map_sharpness, trajectory_error
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Track
-from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.trajectories import read_tum
 from uw_dslam_ros2.io.vehicles import find_recordings

@@ -43,7 +43,7 @@ from uw_dslam_ros2.core.metrics import (
 from uw_dslam_ros2.io.bags import TransformEvent, TruthEvent, read_events
 from uw_dslam_ros2.io.datasets.aracati2017 import SEGMENTS, read_aracati2017, write_bag
 from uw_dslam_ros2.io.feeding import feed, in_stamp_order
-from uw_dslam_ros2.io.maps import read_map
+from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.trajectories import read_tum

@@ -21,7 +21,7 @@ from uw_dslam_ros2.core.chart.refine import (
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNKNOWN, GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.occupancy import SIGHT_CELLS, GrowingGrid
+from uw_dslam_ros2.core.mapping.drawing.occupancy import SIGHT_CELLS, GrowingGrid
 from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.chart.drawing import SHARE_AGAINST, PingTrack, refined
 from uw_dslam_ros2.core.chart.pings import DrawnPing
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
 from uw_dslam_ros2.core.se2 import SE2, compose_poses, wrap_angle
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 

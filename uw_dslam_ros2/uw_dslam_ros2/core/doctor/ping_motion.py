@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.sample import PingSample
-from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points, thin
+from uw_dslam_ros2.core.mapping.scans.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = ["PingMotions", "have_echoes", "ping_motions"]

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import SubmapConfig, VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.local_map import joined
-from uw_dslam_ros2.core.mapping.log_odds_grid import CompressedGrid
-from uw_dslam_ros2.core.mapping.matcher import thin
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.drawing.log_odds_grid import CompressedGrid
+from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.scans.local_map import joined
+from uw_dslam_ros2.core.mapping.scans.matcher import thin
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.turning import PlacedSweep
 from uw_dslam_ros2.core.sonar.types import Detections

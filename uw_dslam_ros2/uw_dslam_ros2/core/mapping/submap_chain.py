@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.estimators import make_estimator
+from uw_dslam_ros2.core.mapping.loops.estimators import make_estimator
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.mapping.vehicle_map import VehicleMap, path_of
 from uw_dslam_ros2.core.pose_graph import chained_covariance

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.key_pings import KeyPings
+from uw_dslam_ros2.core.mapping.scans.key_pings import KeyPings
 from uw_dslam_ros2.core.mapping.submap_chain import MapperWatch, SubmapChain
 from uw_dslam_ros2.core.mapping.vehicle_navigation import VehicleNavigation
 from uw_dslam_ros2.core.se2 import SE2

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
-from uw_dslam_ros2.core.mapping.matcher import LikelihoodField, Prior, match_points
-from uw_dslam_ros2.core.mapping.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.scans.matcher import LikelihoodField, Prior, match_points
 from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.detect import detections_from_points

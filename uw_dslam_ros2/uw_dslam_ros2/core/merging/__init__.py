@@ -1,19 +1,19 @@
 """Many submaps of many vehicles, in any order, into one map."""
 
-from uw_dslam_ros2.core.merging.ages import last_seen_ns
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
-from uw_dslam_ros2.core.merging.decisions import (
+from uw_dslam_ros2.core.merging.drawn.ages import last_seen_ns
+from uw_dslam_ros2.core.merging.graph.components import LoopError
+from uw_dslam_ros2.core.merging.growing_map import GrowingMap, GrowingMapConfig, MapChange
+from uw_dslam_ros2.core.merging.queue import MapQueue
+from uw_dslam_ros2.core.merging.state import QueueState
+from uw_dslam_ros2.core.merging.steering.decisions import (
     Decision,
     DecisionKind,
     DecisionLog,
     DecisionRecord,
 )
-from uw_dslam_ros2.core.merging.georeference import Fix, Georeference
-from uw_dslam_ros2.core.merging.graph.components import LoopError
-from uw_dslam_ros2.core.merging.growing_map import GrowingMap, GrowingMapConfig, MapChange
-from uw_dslam_ros2.core.merging.queue import MapQueue
-from uw_dslam_ros2.core.merging.start_poses import StartPoses
-from uw_dslam_ros2.core.merging.state import QueueState
+from uw_dslam_ros2.core.merging.steering.georeference import Fix, Georeference
+from uw_dslam_ros2.core.merging.steering.start_poses import StartPoses
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     ConstraintKind,

@@ -10,7 +10,6 @@ from collections.abc import Set as AbstractSet
 from uw_dslam_ros2.core.merging.asking.growing import make_growing_plan
 from uw_dslam_ros2.core.merging.asking.pairwise import make_pairwise_plan
 from uw_dslam_ros2.core.merging.asking.plan import Plan, make_plan
-from uw_dslam_ros2.core.merging.by_hand import matches_by_hand
 from uw_dslam_ros2.core.merging.checks.contradictions import contradicting_map
 from uw_dslam_ros2.core.merging.checks.soundness import (
     contested_track,
@@ -18,13 +17,14 @@ from uw_dslam_ros2.core.merging.checks.soundness import (
     implausible_submaps,
 )
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
-from uw_dslam_ros2.core.merging.decisions import DecisionLog
-from uw_dslam_ros2.core.merging.georeference import Fix, Georeference, pulled_by_fixes
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import Component
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.memory import Memory
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
+from uw_dslam_ros2.core.merging.steering.by_hand import matches_by_hand
+from uw_dslam_ros2.core.merging.steering.decisions import DecisionLog
+from uw_dslam_ros2.core.merging.steering.georeference import Fix, Georeference, pulled_by_fixes
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.submap import SubmapId, Track
 

@@ -8,23 +8,23 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.arrivals import Arrivals
 from uw_dslam_ros2.core.merging.asking.plan import Plan
-from uw_dslam_ros2.core.merging.by_hand import check_decision, remarks, stated_pose
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
-from uw_dslam_ros2.core.merging.decisions import (
-    Decision,
-    DecisionKind,
-    DecisionLog,
-    DecisionRecord,
-)
-from uw_dslam_ros2.core.merging.georeference import Fix, Georeference
-from uw_dslam_ros2.core.merging.global_map import GlobalMap
+from uw_dslam_ros2.core.merging.drawn.global_map import GlobalMap
+from uw_dslam_ros2.core.merging.drawn.trajectories import Trajectory, trajectories_of
 from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import LoopError
 from uw_dslam_ros2.core.merging.records import constraints_of, records_of
 from uw_dslam_ros2.core.merging.requests import Requests
 from uw_dslam_ros2.core.merging.standing import Standing
 from uw_dslam_ros2.core.merging.state import QueueState
-from uw_dslam_ros2.core.merging.trajectories import Trajectory, trajectories_of
+from uw_dslam_ros2.core.merging.steering.by_hand import check_decision, remarks, stated_pose
+from uw_dslam_ros2.core.merging.steering.decisions import (
+    Decision,
+    DecisionKind,
+    DecisionLog,
+    DecisionRecord,
+)
+from uw_dslam_ros2.core.merging.steering.georeference import Fix, Georeference
 from uw_dslam_ros2.core.merging.types import (
     Constraint,
     MapProvenance,

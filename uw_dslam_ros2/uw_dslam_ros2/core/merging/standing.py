@@ -5,15 +5,15 @@ from __future__ import annotations
 from uw_dslam_ros2.core.merging.arrivals import Arrivals
 from uw_dslam_ros2.core.merging.asking.plan import Plan
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
-from uw_dslam_ros2.core.merging.decisions import DecisionLog
-from uw_dslam_ros2.core.merging.drawing import Drawing
-from uw_dslam_ros2.core.merging.frame import GlobalFrame
-from uw_dslam_ros2.core.merging.georeference import Fix
-from uw_dslam_ros2.core.merging.global_map import GlobalMap
+from uw_dslam_ros2.core.merging.drawn.drawing import Drawing
+from uw_dslam_ros2.core.merging.drawn.frame import GlobalFrame
+from uw_dslam_ros2.core.merging.drawn.global_map import GlobalMap
 from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.merging.planning import Planning
+from uw_dslam_ros2.core.merging.steering.decisions import DecisionLog
+from uw_dslam_ros2.core.merging.steering.georeference import Fix
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uw_dslam_ros2.core.grid import GridSpec
-from uw_dslam_ros2.core.merging.decisions import Decision
-from uw_dslam_ros2.core.merging.georeference import Fix
 from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
+from uw_dslam_ros2.core.merging.steering.decisions import Decision
+from uw_dslam_ros2.core.merging.steering.georeference import Fix
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["QueueState"]

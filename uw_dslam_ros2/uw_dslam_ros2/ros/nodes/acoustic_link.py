@@ -19,10 +19,10 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.link import AcousticLink, LinkConfig, LinkState
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
-from uw_dslam_ros2.io.link_state import load_link_state, save_link_state
+from uw_dslam_ros2.io.sessions.link_state import load_link_state, save_link_state
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_id_of, submap_to_msg
+from uw_dslam_ros2.ros.manager.missing_submaps import MissingSubmaps
 from uw_dslam_ros2.ros.plumbing.diagnostics import Diagnostics, Report
-from uw_dslam_ros2.ros.plumbing.missing_submaps import MissingSubmaps
 from uw_dslam_ros2.ros.plumbing.node_settings import AcousticLinkConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import ANSWERS, MODEM, SUBMAPS

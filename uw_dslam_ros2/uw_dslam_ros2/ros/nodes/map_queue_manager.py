@@ -18,25 +18,25 @@ from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import GrowingMapConfig, MapChange, MapQueue, MapQueueConfig
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.io.session import load_session
+from uw_dslam_ros2.io.sessions.session import load_session
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_id_of
+from uw_dslam_ros2.ros.manager.fix_inputs import FixInputs
+from uw_dslam_ros2.ros.manager.group_maps import GroupMaps
+from uw_dslam_ros2.ros.manager.map_inputs import MapInputs
+from uw_dslam_ros2.ros.manager.map_publisher import MapPublisher
+from uw_dslam_ros2.ros.manager.missing_submaps import MissingSubmaps
+from uw_dslam_ros2.ros.manager.outputs import QueueFrames, StatusPublisher
+from uw_dslam_ros2.ros.manager.requests import QueueRequests
+from uw_dslam_ros2.ros.manager.services import QueueServices
+from uw_dslam_ros2.ros.manager.session_keeper import SessionKeeper
+from uw_dslam_ros2.ros.manager.shared_decisions import SharedDecisions
 from uw_dslam_ros2.ros.plumbing.diagnostics import Report
-from uw_dslam_ros2.ros.plumbing.fix_inputs import FixInputs
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S
-from uw_dslam_ros2.ros.plumbing.group_maps import GroupMaps
 from uw_dslam_ros2.ros.plumbing.idle_timeout import IdleTimeout
 from uw_dslam_ros2.ros.plumbing.managed_node import ManagedNode
-from uw_dslam_ros2.ros.plumbing.map_inputs import MapInputs
-from uw_dslam_ros2.ros.plumbing.map_publisher import MapPublisher
-from uw_dslam_ros2.ros.plumbing.missing_submaps import MissingSubmaps
 from uw_dslam_ros2.ros.plumbing.node_settings import MapQueueManagerConfig
 from uw_dslam_ros2.ros.plumbing.qos import SUBMAPS
-from uw_dslam_ros2.ros.plumbing.queue_outputs import QueueFrames, StatusPublisher
-from uw_dslam_ros2.ros.plumbing.queue_requests import QueueRequests
-from uw_dslam_ros2.ros.plumbing.queue_services import QueueServices
 from uw_dslam_ros2.ros.plumbing.running import run_node
-from uw_dslam_ros2.ros.plumbing.session_keeper import SessionKeeper
-from uw_dslam_ros2.ros.plumbing.shared_decisions import SharedDecisions
 from uw_dslam_ros2.ros.plumbing.throttle import Throttle
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 

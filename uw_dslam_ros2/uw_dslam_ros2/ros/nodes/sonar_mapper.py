@@ -21,19 +21,19 @@ from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed_runs
 from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.readings import PINGS, TransformEvent
-from uw_dslam_ros2.ros.plumbing.convention_watch import ConventionWatch
+from uw_dslam_ros2.ros.mapper.convention_watch import ConventionWatch
+from uw_dslam_ros2.ros.mapper.last_pass import LastPass
+from uw_dslam_ros2.ros.mapper.outputs import MapperOutputs
+from uw_dslam_ros2.ros.mapper.sensor_silence import SensorSilence
+from uw_dslam_ros2.ros.mapper.sensor_topics import SensorTopics
+from uw_dslam_ros2.ros.mapper.services import MapperServices
+from uw_dslam_ros2.ros.mapper.stamp_order import StampOrder
 from uw_dslam_ros2.ros.plumbing.diagnostics import Report
 from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, Transforms
-from uw_dslam_ros2.ros.plumbing.last_pass import LastPass
 from uw_dslam_ros2.ros.plumbing.managed_node import ManagedNode
-from uw_dslam_ros2.ros.plumbing.mapper_outputs import MapperOutputs
-from uw_dslam_ros2.ros.plumbing.mapper_services import MapperServices
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 from uw_dslam_ros2.ros.plumbing.running import run_node
 from uw_dslam_ros2.ros.plumbing.sensor_inputs import SensorInput, check_stamp
-from uw_dslam_ros2.ros.plumbing.sensor_silence import SensorSilence
-from uw_dslam_ros2.ros.plumbing.sensor_topics import SensorTopics
-from uw_dslam_ros2.ros.plumbing.stamp_order import StampOrder
 from uw_dslam_ros2.ros.plumbing.throttle import Throttle
 from uw_dslam_ros2.ros.plumbing.worker import Worker
 

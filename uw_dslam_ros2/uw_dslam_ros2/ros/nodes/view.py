@@ -26,7 +26,7 @@ from uw_dslam_ros2.ros.convert.merging import (
     constraint_from_msg,
     record_from_msg,
 )
-from uw_dslam_ros2.ros.plumbing.diagnostics_board import DiagnosticsBoard
+from uw_dslam_ros2.ros.manager.diagnostics_board import DiagnosticsBoard
 from uw_dslam_ros2.ros.plumbing.node_settings import ViewConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.qos import DEFAULT, LATCHED, SERVICES

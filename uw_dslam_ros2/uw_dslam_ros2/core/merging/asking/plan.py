@@ -28,13 +28,13 @@ from dataclasses import dataclass
 from uw_dslam_ros2.core.merging.checks.places import touching_tracks
 from uw_dslam_ros2.core.merging.checks.verification import Verifier
 from uw_dslam_ros2.core.merging.config import VAGUE_CELLS, MapQueueConfig
-from uw_dslam_ros2.core.merging.georeference import Georeference
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import Component, Constraint
 from uw_dslam_ros2.core.merging.graph.consistency import Side
 from uw_dslam_ros2.core.merging.graph.descriptors import promise
 from uw_dslam_ros2.core.merging.graph.library import Library
 from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
+from uw_dslam_ros2.core.merging.steering.georeference import Georeference
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.submap import SubmapId, Track
 

@@ -15,7 +15,6 @@ from uw_dslam_ros2.core.merging.config import (
     MAX_MAP_CELLS,
     NUM_NEIGHBOURS,
 )
-from uw_dslam_ros2.core.merging.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.graph.answers import Query
 from uw_dslam_ros2.core.merging.graph.components import Component, Constraint
 from uw_dslam_ros2.core.merging.graph.consistency import Side
@@ -30,6 +29,7 @@ from uw_dslam_ros2.core.merging.graph.submap_groups import (
     render_group,
     shared_area_m2,
 )
+from uw_dslam_ros2.core.merging.steering.decisions import DecisionLog
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track
 

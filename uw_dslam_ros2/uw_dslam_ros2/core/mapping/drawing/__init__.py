@@ -1,0 +1,1 @@
+"""Echoes and free water become the cells of a grid."""

@@ -1,0 +1,1 @@
+"""A ping is matched with the last stretch of the path."""

@@ -1,0 +1,1 @@
+"""The global map, its frame, and when walls were last seen."""

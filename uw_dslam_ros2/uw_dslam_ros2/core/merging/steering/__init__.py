@@ -1,0 +1,1 @@
+"""What people, fixes and known starts say of a merge."""

@@ -1,0 +1,1 @@
+"""A merge on disk: sessions with checksums, and what links keep."""

@@ -1,0 +1,1 @@
+"""What the sonar mapper does with topics, services and the order of stamps."""
