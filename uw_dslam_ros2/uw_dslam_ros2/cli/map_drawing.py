@@ -124,9 +124,10 @@ def extent_m(occupancy: OccupancyMap) -> tuple[float, float]:
 def show_map(axes: Axes, occupancy: OccupancyMap) -> None:
     """Show what a map knows."""
     values = occupancy.values
-    # Between free and wall the shade follows the probability.
-    share = np.linspace(0.0, 1.0, OCCUPIED - FREE + 1)[:, None]
-    shades = (1.0 - share) * np.array(FREE_COLOR) + share * np.array(WALL_COLOR)
+    # From free to wall by the probability: what is as likely as not looks like what is unknown.
+    sure = np.linspace(-1.0, 1.0, OCCUPIED - FREE + 1)[:, None]
+    ends = np.where(sure < 0.0, FREE_COLOR, WALL_COLOR)
+    shades = (1.0 - np.abs(sure)) * np.array(UNKNOWN_COLOR) + np.abs(sure) * ends
     table = np.rint(255.0 * np.vstack([UNKNOWN_COLOR, shades])).astype(np.uint8)
     low, high = cropped(occupancy)
     cells = values[low[0] : high[0], low[1] : high[1]]

@@ -25,11 +25,14 @@ _WALL = (22, 38, 54)
 
 
 def colours_of_percent() -> ByteArray:
-    """(102, 4) red, green, blue, opacity of a stored cell: 0 unknown, else percent + 1."""
-    share = np.linspace(0.0, 1.0, 101)[:, None]
+    """(102, 4) red, green, blue, opacity of a stored cell: 0 unknown, else percent + 1.
+
+    What is as likely free as not looks like what is unknown.
+    """
+    sure = np.linspace(-1.0, 1.0, 101)
     table = np.zeros((102, 4), np.uint8)
-    table[1:, :3] = np.rint((1.0 - share) * np.array(_FREE) + share * np.array(_WALL))
-    table[1:, 3] = 255
+    table[1:, :3] = np.where(sure[:, None] < 0.0, _FREE, _WALL)
+    table[1:, 3] = np.rint(255.0 * np.abs(sure))
     return table
 
 
