@@ -20,7 +20,7 @@ from harness import emit, require, run_cases
 
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig, section
 from uw_dslam_ros2.core.mapping import vehicle_mapper as mapper_module
-from uw_dslam_ros2.core.mapping.loops.closures import estimators
+from uw_dslam_ros2.core.mapping.loops import estimators
 from uw_dslam_ros2.core.mapping.scans import local_map
 from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.core.sonar import SonarImage

@@ -9,7 +9,7 @@ import pytest
 
 from uw_dslam_ros2.core.mapping import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.config import LoopRegistrationConfig
-from uw_dslam_ros2.core.mapping.loops.closures import verdict as loop_verdict
+from uw_dslam_ros2.core.mapping.loops import verdict as loop_verdict
 from uw_dslam_ros2.core.mapping.loops.verdict import _RULES
 from uw_dslam_ros2.core.mapping.scans.matcher import ScanMatch
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict

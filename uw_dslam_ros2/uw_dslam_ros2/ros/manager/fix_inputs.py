@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -16,11 +16,13 @@ from uw_dslam_ros2.core.errors import ConfigError, InvalidInputError
 from uw_dslam_ros2.core.merging import Fix
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.drivers import ADAPTERS, Adapter, ReadSettings
-from uw_dslam_ros2.io.fixes import FixLog
 from uw_dslam_ros2.io.readings import FixEvent, Reading
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.ros.plumbing.qos import sensor_qos
 from uw_dslam_ros2.ros.plumbing.sensor_inputs import check_stamp
+
+if TYPE_CHECKING:
+    from uw_dslam_ros2.io.fixes import FixLog
 
 __all__ = ["FixInputs"]
 
@@ -75,7 +77,12 @@ class FixInputs:
         self._topics = [f"/{topic.strip('/')}" for topic in topics]
         self._subscriptions: dict[str, Subscription] = {}
         self._group = ReentrantCallbackGroup()
-        self._log = FixLog(sigma_m)
+        self._log: FixLog | None = None
+        if topics:
+            # What knows of places on earth is large, and most managers never meet a fix.
+            from uw_dslam_ros2.io.fixes import FixLog
+
+            self._log = FixLog(sigma_m)
         self._looked_s = float("-inf")
         self._is_new = False
 
@@ -116,7 +123,7 @@ class FixInputs:
 
     def _take(self, events: Sequence[Reading]) -> None:
         for event in events:
-            if isinstance(event, FixEvent):
+            if isinstance(event, FixEvent) and self._log is not None:
                 self._log.note(event)
                 self._is_new = True
 
@@ -127,7 +134,7 @@ class FixInputs:
     def due(self, submaps: Callable[[], Iterable[Submap]]) -> list[Fix]:
         """What is said of submaps; none while nothing is new, or soon after the last time."""
         now_s = time.monotonic()
-        if not (self._topics and self._is_new) or now_s - self._looked_s < _PERIOD_S:
+        if self._log is None or not self._is_new or now_s - self._looked_s < _PERIOD_S:
             return []
         self._looked_s, self._is_new = now_s, False
         return self._log.fixes(submaps())
