@@ -20,6 +20,7 @@ from uw_dslam_msgs.srv import SaveSession
 
 from uw_dslam_ros2.cli.mapping import map_recording, settle
 from uw_dslam_ros2.cli.processes import Children
+from uw_dslam_ros2.core.chart.redraw import redrawn
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.metrics import trajectory_error
@@ -176,10 +177,11 @@ def error_of(mission, trajectories):
 
 
 def undisturbed(mission):
-    """What the same core makes of the same bags when nothing happens."""
-    queue = MapQueue()
+    """What the same core makes of the same bags when nothing happens, the last pass included."""
+    queue, config = MapQueue(), VehicleMapperConfig()
     for recording in find_recordings(list(mission.bags))[0]:
-        for submap in map_recording(recording, VehicleMapperConfig()).submaps:
+        mapped = map_recording(recording, config)
+        for submap in redrawn(mapped.submaps, mapped.pings, config.occupancy):
             queue.add_submap(submap)
     settle(queue, GridRegistrationConfig())
     return error_of(mission, queue.trajectories())
