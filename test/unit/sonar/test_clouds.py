@@ -72,3 +72,10 @@ def test_few_points_of_a_turn_are_all_kept_and_say_nothing_of_other_beams():
     for x, y in points:
         beam = np.argmin(np.abs(turn.bearing_rad - math.atan2(y, x)))
         assert turn.free_range_m[beam] == pytest.approx(math.hypot(x, y))
+
+
+def test_a_point_straight_behind_has_a_beam_of_its_own():
+    """Its bearing, half a turn, may be a whole number of beams."""
+    turn = detections_from_points(0, [[-5.0, 0.0]], turn_spacing_rad=math.pi / 128)
+    assert len(turn.points) == 1
+    assert turn.free_range_m.max() == pytest.approx(5.0)

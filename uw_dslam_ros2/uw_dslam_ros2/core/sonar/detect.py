@@ -120,7 +120,7 @@ def detections_from_points(
     np.minimum.at(nearest, inverse, ranges)
     if turn_spacing_rad > 0.0 and own_spacing_rad == 0.0:
         # The beams without an echo were there, too; how far they saw is not known.
-        around = np.arange(math.floor(-np.pi / width), math.ceil(np.pi / width))
+        around = np.arange(math.floor(-np.pi / width), math.floor(np.pi / width) + 1)
         free = np.zeros(len(around))
         free[np.searchsorted(around, unique)] = nearest
         unique, nearest = around, free
