@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from std_msgs.msg import UInt8MultiArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
@@ -14,7 +12,7 @@ from uw_dslam_ros2.core.link.coding.answers import AnswerExchange, decode_answer
 from uw_dslam_ros2.core.merging import MatchRequest
 from uw_dslam_ros2.core.merging.graph.answers import QueryKey
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
-from uw_dslam_ros2.ros.plumbing.qos import ANSWERS
+from uw_dslam_ros2.ros.manager.link_topic import link_topic
 
 __all__ = ["SharedAnswers"]
 
@@ -53,18 +51,7 @@ class SharedAnswers:
         self._exchange = AnswerExchange()
         self._used: dict[bytes, tuple[QueryKey, bytes]] = {}
         self._is_worth_a_look = False
-        self._output: Publisher | None = None
-        if not link:
-            return
-        topic = f"/{link.strip('/')}/link/answers"
-        self._output = node.create_publisher(UInt8MultiArray, topic, ANSWERS)
-        node.create_subscription(
-            UInt8MultiArray,
-            f"{topic}_heard",
-            lambda msg: post(lambda: self._take(bytes(msg.data))),
-            ANSWERS,
-            callback_group=ReentrantCallbackGroup(),
-        )
+        self._output = link_topic(node, link, "answers", post, self._take)
 
     def note_change(self) -> None:
         """There may be new questions, which others have answered."""

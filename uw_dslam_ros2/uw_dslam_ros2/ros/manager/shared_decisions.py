@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from std_msgs.msg import UInt8MultiArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.merging.steering.told_decisions import ToldDecisions
-from uw_dslam_ros2.ros.plumbing.qos import ANSWERS
+from uw_dslam_ros2.ros.manager.link_topic import link_topic
 
 __all__ = ["SharedDecisions"]
 
@@ -48,18 +46,7 @@ class SharedDecisions:
         self._owner = owner
         self._told = ToldDecisions()
         self._is_worth_a_look = True
-        self._output: Publisher | None = None
-        if not link:
-            return
-        topic = f"/{link.strip('/')}/link/decisions"
-        self._output = node.create_publisher(UInt8MultiArray, topic, ANSWERS)
-        node.create_subscription(
-            UInt8MultiArray,
-            f"{topic}_heard",
-            lambda msg: post(lambda: self._take(bytes(msg.data))),
-            ANSWERS,
-            callback_group=ReentrantCallbackGroup(),
-        )
+        self._output = link_topic(node, link, "decisions", post, self._take)
 
     def note_change(self) -> None:
         """The queue's log may be another than before."""
