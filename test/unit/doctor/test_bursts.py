@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.doctor.bursts import choose_pings, more_pings
-from uw_dslam_ros2.core.doctor.fits import TurnFit, confidence_of
-from uw_dslam_ros2.core.doctor.ping_motion import PingMotions
+from uw_dslam_ros2.core.doctor.motions.fits import TurnFit, confidence_of
+from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions
+from uw_dslam_ros2.core.doctor.samples.bursts import choose_pings, more_pings
 
 PINGS_S = np.arange(0.0, 600.0, 0.33)
 IMU_S = np.arange(0.0, 600.0, 0.05)

@@ -9,7 +9,7 @@ import pytest
 from unit.doctor.made_up_vehicle import vehicle
 
 from uw_dslam_ros2.core.doctor import PingSample, examine
-from uw_dslam_ros2.core.doctor.imu import compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.judging.imu import compare_yaw_and_rate
 
 SEEDS = (1, 2)
 

@@ -8,7 +8,7 @@ import pytest
 from unit.doctor.made_up_vehicle import drive, vehicle
 
 from uw_dslam_ros2.core.doctor import NavigationSample, PingSample, examine
-from uw_dslam_ros2.core.doctor.odometry import OdometrySample
+from uw_dslam_ros2.core.doctor.judging.odometry import OdometrySample
 
 NONE = NavigationSample(*(np.empty(0),) * 4, np.empty((0, 2)))
 DEEP_M = 2.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.doctor.speckle import decibels_per_count, patch_levels, quantity_of
+from uw_dslam_ros2.core.doctor.samples.speckle import decibels_per_count, patch_levels, quantity_of
 
 
 def power(seed, shape=(400, 256)):

@@ -8,9 +8,9 @@ import pytest
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, NavigationSample
-from uw_dslam_ros2.core.doctor.kernels import mean_nearness
-from uw_dslam_ros2.core.doctor.turning import BeamSample
-from uw_dslam_ros2.core.doctor.turning_verdict import choose_spans, examine_turning
+from uw_dslam_ros2.core.doctor.turning.kernels import mean_nearness
+from uw_dslam_ros2.core.doctor.turning.turns import BeamSample
+from uw_dslam_ros2.core.doctor.turning.verdict import choose_spans, examine_turning
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.instruments import InstrumentConfig
 from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, MissionConfig, plan_mission

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, SampleCollector, examine
-from uw_dslam_ros2.core.doctor.bursts import choose_pings, more_pings
-from uw_dslam_ros2.core.doctor.ping_motion import have_echoes
-from uw_dslam_ros2.core.doctor.turning_verdict import choose_spans, examine_turning
+from uw_dslam_ros2.core.doctor.motions.ping_motion import have_echoes
+from uw_dslam_ros2.core.doctor.samples.bursts import choose_pings, more_pings
+from uw_dslam_ros2.core.doctor.turning.verdict import choose_spans, examine_turning
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.sonar import SonarConfig

@@ -3,7 +3,7 @@
 from uw_dslam_ros2.core.doctor.collector import SampleCollector
 from uw_dslam_ros2.core.doctor.examination import Examination
 from uw_dslam_ros2.core.doctor.examine import examine
-from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
+from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample, PingSample
 
 __all__ = [
     "Examination",

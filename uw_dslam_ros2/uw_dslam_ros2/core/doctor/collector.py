@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uw_dslam_ros2.core.doctor.odometry import OdometrySample
-from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
-from uw_dslam_ros2.core.doctor.speckle import decibels_per_count, patch_levels, quantity_of
-from uw_dslam_ros2.core.doctor.turning import BeamSample
+from uw_dslam_ros2.core.doctor.judging.odometry import OdometrySample
+from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample, PingSample
+from uw_dslam_ros2.core.doctor.samples.speckle import decibels_per_count, patch_levels, quantity_of
+from uw_dslam_ros2.core.doctor.turning.turns import BeamSample
 from uw_dslam_ros2.core.navigation.pose_differences import PoseDifferences
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import (

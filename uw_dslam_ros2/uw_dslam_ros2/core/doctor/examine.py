@@ -12,10 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.alone import judge_imu, without_spikes, without_zeros
-from uw_dslam_ros2.core.doctor.delays import Delays, find_delays, late_in_words
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.fits import (
+from uw_dslam_ros2.core.doctor.judging.alone import judge_imu, without_spikes, without_zeros
+from uw_dslam_ros2.core.doctor.judging.images import judge_images
+from uw_dslam_ros2.core.doctor.judging.imu import ImuState, compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.judging.knocks import judge_knock
+from uw_dslam_ros2.core.doctor.judging.odometry import OdometrySample, examine_odometry
+from uw_dslam_ros2.core.doctor.judging.scales import confidence_in, judge_scale
+from uw_dslam_ros2.core.doctor.motions.delays import Delays, find_delays, late_in_words
+from uw_dslam_ros2.core.doctor.motions.fits import (
     SURE,
     TurnFit,
     VelocityFit,
@@ -25,13 +30,8 @@ from uw_dslam_ros2.core.doctor.fits import (
     fit_velocity,
     turn_bias,
 )
-from uw_dslam_ros2.core.doctor.images import judge_images
-from uw_dslam_ros2.core.doctor.imu import ImuState, compare_yaw_and_rate
-from uw_dslam_ros2.core.doctor.knocks import judge_knock
-from uw_dslam_ros2.core.doctor.odometry import OdometrySample, examine_odometry
-from uw_dslam_ros2.core.doctor.ping_motion import PingMotions, ping_motions
-from uw_dslam_ros2.core.doctor.sample import NavigationSample, PingSample
-from uw_dslam_ros2.core.doctor.scales import confidence_in, judge_scale
+from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions, ping_motions
+from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample, PingSample
 
 __all__ = ["examine"]
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from uw_dslam_ros2.core.doctor.delays import late_in_words
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.imu import ImuState
-from uw_dslam_ros2.core.doctor.sample import NavigationSample
+from uw_dslam_ros2.core.doctor.judging.imu import ImuState
+from uw_dslam_ros2.core.doctor.motions.delays import late_in_words
+from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
 
 __all__ = ["judge_imu", "without_spikes", "without_zeros"]
 

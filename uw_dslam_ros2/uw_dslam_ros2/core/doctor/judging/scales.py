@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.fits import VelocityFit
+from uw_dslam_ros2.core.doctor.motions.fits import VelocityFit
 
 __all__ = ["confidence_in", "is_scale_wrong", "judge_scale"]
 

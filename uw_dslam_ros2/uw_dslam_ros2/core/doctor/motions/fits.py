@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.ping_motion import PingMotions
-from uw_dslam_ros2.core.doctor.sample import NavigationSample
+from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions
+from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
 
 __all__ = [
     "SURE",

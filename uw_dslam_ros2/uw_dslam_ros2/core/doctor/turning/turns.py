@@ -15,9 +15,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.fits import at_times
-from uw_dslam_ros2.core.doctor.kernels import mean_nearness
-from uw_dslam_ros2.core.doctor.sample import NavigationSample
+from uw_dslam_ros2.core.doctor.motions.fits import at_times
+from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
+from uw_dslam_ros2.core.doctor.turning.kernels import mean_nearness
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.se2 import SE2
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.fits import VelocityFit, confidence_of_lead
-from uw_dslam_ros2.core.doctor.ping_motion import PingMotions
+from uw_dslam_ros2.core.doctor.motions.fits import VelocityFit, confidence_of_lead
+from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions
 
 __all__ = ["judge_knock"]
 

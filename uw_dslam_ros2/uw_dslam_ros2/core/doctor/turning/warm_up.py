@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uw_dslam_ros2.core.doctor.kernels import mean_nearness
+from uw_dslam_ros2.core.doctor.turning.kernels import mean_nearness
 
 __all__ = ["warm_up"]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.fits import at_times, turned
+from uw_dslam_ros2.core.doctor.motions.fits import at_times, turned
 
 __all__ = ["ImuState", "compare_yaw_and_rate"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uw_dslam_ros2.core.doctor.fits import TurnFit, VelocityFit, confidence_of
+from uw_dslam_ros2.core.doctor.motions.fits import TurnFit, VelocityFit, confidence_of
 
 __all__ = ["Delays", "find_delays", "late_in_words"]
 

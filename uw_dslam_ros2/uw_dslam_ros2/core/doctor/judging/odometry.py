@@ -9,9 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.delays import late_in_words
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.fits import (
+from uw_dslam_ros2.core.doctor.judging.scales import confidence_in, is_scale_wrong
+from uw_dslam_ros2.core.doctor.motions.delays import late_in_words
+from uw_dslam_ros2.core.doctor.motions.fits import (
     SURE,
     TurnFit,
     VelocityFit,
@@ -20,9 +21,8 @@ from uw_dslam_ros2.core.doctor.fits import (
     fit_turns,
     fit_velocity,
 )
-from uw_dslam_ros2.core.doctor.ping_motion import PingMotions
-from uw_dslam_ros2.core.doctor.sample import NavigationSample
-from uw_dslam_ros2.core.doctor.scales import confidence_in, is_scale_wrong
+from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions
+from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.se2 import SE2
 

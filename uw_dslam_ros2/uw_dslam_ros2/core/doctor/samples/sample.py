@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.speckle import Quantity
+from uw_dslam_ros2.core.doctor.samples.speckle import Quantity
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.se2 import SE2
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.sample import PingSample
+from uw_dslam_ros2.core.doctor.samples.sample import PingSample
 from uw_dslam_ros2.core.mapping.scans.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.se2 import SE2
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.sample import PingSample
+from uw_dslam_ros2.core.doctor.samples.sample import PingSample
 
 __all__ = ["judge_images"]
 

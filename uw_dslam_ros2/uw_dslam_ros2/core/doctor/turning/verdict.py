@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.delays import late_in_words
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.fits import SURE
-from uw_dslam_ros2.core.doctor.imu import compare_yaw_and_rate
-from uw_dslam_ros2.core.doctor.sample import NavigationSample
-from uw_dslam_ros2.core.doctor.turning import (
+from uw_dslam_ros2.core.doctor.judging.imu import compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.motions.delays import late_in_words
+from uw_dslam_ros2.core.doctor.motions.fits import SURE
+from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
+from uw_dslam_ros2.core.doctor.turning.turns import (
     BeamSample,
     TurningFit,
     TurningTrial,

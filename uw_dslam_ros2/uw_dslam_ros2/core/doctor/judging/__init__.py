@@ -1,0 +1,1 @@
+"""What is said of each sensor, by itself and by the echoes."""

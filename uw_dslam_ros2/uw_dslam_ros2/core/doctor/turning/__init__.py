@@ -1,0 +1,1 @@
+"""Of a sonar that turns: turns laid on one another, and what they tell."""
