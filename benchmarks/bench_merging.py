@@ -19,7 +19,7 @@ from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, Occupancy
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
-from uw_dslam_ros2.sim.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
+from uw_dslam_ros2.sim.maps.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
 
 _MAX_RMSE_M = 0.5  # one cell, for a hundred submaps
 _NUM_LATE = 10

@@ -23,9 +23,9 @@ from harness import emit, require, run_cases
 
 from uw_dslam_ros2.cli.processes import free_domain
 from uw_dslam_ros2.ros.plumbing.mission_control import MissionControl
-from uw_dslam_ros2.sim.mission import MissionConfig
-from uw_dslam_ros2.sim.recording import simulate_mission
-from uw_dslam_ros2.sim.sonar import SonarConfig
+from uw_dslam_ros2.sim.missions.mission import MissionConfig
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
+from uw_dslam_ros2.sim.sonars.imaging import SonarConfig
 
 _RATE_HZ = 10.0
 _LIMIT_MB = 1000.0

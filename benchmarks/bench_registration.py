@@ -36,7 +36,7 @@ from uw_dslam_ros2.core.registration.search.branch_and_bound import (
     search,
 )
 from uw_dslam_ros2.core.registration.search.field import Field, mixture_field
-from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem
+from uw_dslam_ros2.sim.maps.point_sets import PointSetProblem, outlier_problem
 
 _SIGMA_M = 0.1  # the paper's
 _NODES_PER_SIGMA = 5.0  # of the field's lattice; its error falls with the third power
@@ -177,7 +177,7 @@ def memory(quick: bool) -> None:
     code = (
         "import json, resource, time\n"
         "from uw_dslam_ros2.core.registration import register_point_sets\n"
-        "from uw_dslam_ros2.sim.point_sets import outlier_problem\n"
+        "from uw_dslam_ros2.sim.maps.point_sets import outlier_problem\n"
         f"p = outlier_problem({m}, 0.0, 0.005, seed=0)\n"
         "base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "start = time.perf_counter()\n"

@@ -29,7 +29,7 @@ from uw_dslam_msgs.msg import Registration
 from uw_dslam_msgs.srv import RegisterMaps
 
 from uw_dslam_ros2.ros.convert.core_types import occupancy_to_msg
-from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
+from uw_dslam_ros2.sim.maps.pairs import MapPair, make_pair
 
 _DOMAIN_ID = 77
 _START = "from uw_dslam_ros2.ros.nodes.registration_server import main; raise SystemExit(main())"

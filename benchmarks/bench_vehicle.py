@@ -28,10 +28,10 @@ from uw_dslam_ros2.io.drivers.projected_image import read_projected
 from uw_dslam_ros2.io.drivers.settings import ReadSettings
 from uw_dslam_ros2.io.interfaces import make_typestore
 from uw_dslam_ros2.io.outgoing import MessageFactory
-from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, MissionConfig, PingMaker
-from uw_dslam_ros2.sim.mission import plan_mission as plan
-from uw_dslam_ros2.sim.sonar import SonarConfig
-from uw_dslam_ros2.sim.world import cast_rays
+from uw_dslam_ros2.sim.missions.mission import T_BASE_DVL, T_BASE_SONAR, MissionConfig, PingMaker
+from uw_dslam_ros2.sim.missions.mission import plan_mission as plan
+from uw_dslam_ros2.sim.sonars.imaging import SonarConfig
+from uw_dslam_ros2.sim.waters.world import cast_rays
 
 _NUM_BEAMS, _NUM_RANGES, _RATE_HZ = 512, 1000, 10.0
 _S = 1_000_000_000

@@ -21,7 +21,7 @@ from uw_dslam_ros2.ros.convert.core_types import transform2d_to_msg
 from uw_dslam_ros2.ros.convert.decisions import decision_from_msg, decision_to_msg
 from uw_dslam_ros2.ros.convert.graph_markers import graph_to_markers
 from uw_dslam_ros2.ros.nodes import registration_server
-from uw_dslam_ros2.sim.fleets import make_result
+from uw_dslam_ros2.sim.maps.fleets import make_result
 
 pytestmark = pytest.mark.ros
 

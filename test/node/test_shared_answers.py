@@ -23,7 +23,7 @@ from uw_dslam_ros2.ros.nodes.acoustic_link import AcousticLinkNode
 from uw_dslam_ros2.ros.nodes.channel import ChannelNode
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.plumbing.qos import ANSWERS, LATCHED, SUBMAPS
-from uw_dslam_ros2.sim.fleets import make_result
+from uw_dslam_ros2.sim.maps.fleets import make_result
 
 pytestmark = pytest.mark.ros
 

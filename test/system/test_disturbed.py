@@ -28,8 +28,8 @@ from uw_dslam_ros2.core.registration import GridRegistrationConfig
 from uw_dslam_ros2.io.recordings import BagWriter, open_bag
 from uw_dslam_ros2.io.trajectories import read_tum
 from uw_dslam_ros2.io.vehicles import find_recordings
-from uw_dslam_ros2.sim.mission import tiny_mission_config
-from uw_dslam_ros2.sim.recording import simulate_mission
+from uw_dslam_ros2.sim.missions.mission import tiny_mission_config
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(600)]
 

@@ -27,8 +27,8 @@ from uw_dslam_ros2.cli.processes import Children
 from uw_dslam_ros2.core.metrics import compare_maps, trajectory_error
 from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.trajectories import read_tum
-from uw_dslam_ros2.sim.mission import tiny_mission_config
-from uw_dslam_ros2.sim.recording import simulate_mission
+from uw_dslam_ros2.sim.missions.mission import tiny_mission_config
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

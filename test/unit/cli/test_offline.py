@@ -12,8 +12,8 @@ from unit.cli import missions
 from uw_dslam_ros2.cli import offline
 from uw_dslam_ros2.io.bags import BagWriter, open_bag
 from uw_dslam_ros2.io.vehicles import find_recordings
-from uw_dslam_ros2.sim.mission import tiny_mission_config
-from uw_dslam_ros2.sim.recording import RecordedMission, simulate_mission
+from uw_dslam_ros2.sim.missions.mission import tiny_mission_config
+from uw_dslam_ros2.sim.missions.recording import RecordedMission, simulate_mission
 
 # Coarser than the default: what is tested here is the way of the data, not the quality.
 SETTINGS = """

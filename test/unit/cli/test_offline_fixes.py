@@ -14,8 +14,8 @@ from uw_dslam_ros2.io.bags import BagWriter, open_bag
 from uw_dslam_ros2.io.earth import utm_position
 from uw_dslam_ros2.io.sessions.session import Session, load_session
 from uw_dslam_ros2.io.trajectories import read_tum
-from uw_dslam_ros2.sim.mission import tiny_mission_config
-from uw_dslam_ros2.sim.recording import simulate_mission
+from uw_dslam_ros2.sim.missions.mission import tiny_mission_config
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
 
 SETTINGS = "/**:\n  ros__parameters:\n    mapper.occupancy.resolution_m: 0.2\n"
 ORIGIN = (54.32, 10.14)

@@ -18,8 +18,8 @@ from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps.files import write_map
-from uw_dslam_ros2.sim.floor_plans import make_place
-from uw_dslam_ros2.sim.map_pairs import make_pair, observe
+from uw_dslam_ros2.sim.maps.floor_plans import make_place
+from uw_dslam_ros2.sim.maps.pairs import make_pair, observe
 
 
 def test_every_study_has_help(capsys):

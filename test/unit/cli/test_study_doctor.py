@@ -7,8 +7,8 @@ import pytest
 from uw_dslam_ros2.cli.studies._corruptions import CORRUPTIONS
 from uw_dslam_ros2.cli.studies.doctor import examined
 from uw_dslam_ros2.cli.study import main
-from uw_dslam_ros2.sim.mission import MissionConfig, plan_mission
-from uw_dslam_ros2.sim.readings import MissionReadings
+from uw_dslam_ros2.sim.missions.mission import MissionConfig, plan_mission
+from uw_dslam_ros2.sim.missions.readings import MissionReadings
 
 FEW = [
     "none", "imu speaks NED", "dvl turned by 45 degrees", "sonar mirrored",

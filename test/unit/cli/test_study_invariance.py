@@ -1,7 +1,7 @@
 """The study of what an answer must not depend on."""
 
 from uw_dslam_ros2.cli.study import main
-from uw_dslam_ros2.sim.map_variants import VARIANTS
+from uw_dslam_ros2.sim.maps.variants import VARIANTS
 
 
 def test_the_study_tells_every_pair_in_every_way(tmp_path, capsys):

@@ -11,7 +11,7 @@ from uw_dslam_ros2.cli.studies import merging
 from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission
 from uw_dslam_ros2.core.merging import MatchRequest
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, known_overlap, lawnmower_fleet, view_from
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, known_overlap, lawnmower_fleet, view_from
 
 
 @pytest.fixture(scope="module")

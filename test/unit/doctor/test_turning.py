@@ -12,10 +12,15 @@ from uw_dslam_ros2.core.doctor.turning.kernels import mean_nearness
 from uw_dslam_ros2.core.doctor.turning.turns import BeamSample
 from uw_dslam_ros2.core.doctor.turning.verdict import choose_spans, examine_turning
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.instruments import InstrumentConfig
-from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, MissionConfig, plan_mission
-from uw_dslam_ros2.sim.turning import TurningSonarConfig, beam_bearing_rad, counted_rad
-from uw_dslam_ros2.sim.vehicle import DriveConfig
+from uw_dslam_ros2.sim.missions.mission import (
+    T_BASE_DVL,
+    T_BASE_SONAR,
+    MissionConfig,
+    plan_mission,
+)
+from uw_dslam_ros2.sim.sonars.turning import TurningSonarConfig, beam_bearing_rad, counted_rad
+from uw_dslam_ros2.sim.vehicles.instruments import InstrumentConfig
+from uw_dslam_ros2.sim.vehicles.vehicle import DriveConfig
 
 TURN = TurningSonarConfig(turn_s=14.0, num_beams=120, max_range_m=40.0)
 SLOW = DriveConfig(speed_m_s=0.4, max_yaw_rate_rad_s=0.15, current_m_s=0.05)

@@ -8,7 +8,7 @@ from unit.merging.fleet import three_vehicles
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.io.maps.provenance import read_provenance, write_provenance
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all
 
 FLEET = three_vehicles(num_submaps=3)
 

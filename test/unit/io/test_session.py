@@ -21,7 +21,7 @@ from uw_dslam_ros2.io.sessions.session import SESSION_FILE, load_session, save_s
 from uw_dslam_ros2.io.sessions.session_export import export_queue
 from uw_dslam_ros2.io.sessions.session_file import Record, opened, read_records, write_records
 from uw_dslam_ros2.io.trajectories import read_g2o, read_tum
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all
 
 FLEET = three_vehicles()
 

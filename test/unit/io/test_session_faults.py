@@ -24,7 +24,7 @@ from uw_dslam_ros2.io.sessions.session import (
     save_session,
 )
 from uw_dslam_ros2.io.sessions.session_export import export_queue
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all
 
 DATA = Path(__file__).parent / "data"
 

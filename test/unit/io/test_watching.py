@@ -8,8 +8,8 @@ import pytest
 from uw_dslam_ros2.core.sonar import SonarConfig
 from uw_dslam_ros2.io.readings import ImuEvent, ScanEvent, VelocityEvent
 from uw_dslam_ros2.io.watching import ReadingWatch
-from uw_dslam_ros2.sim.mission import MissionConfig, plan_mission
-from uw_dslam_ros2.sim.readings import MissionReadings, mounting_of
+from uw_dslam_ros2.sim.missions.mission import MissionConfig, plan_mission
+from uw_dslam_ros2.sim.missions.readings import MissionReadings, mounting_of
 
 SECOND = 1_000_000_000
 

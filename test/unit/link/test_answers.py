@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, make_result
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all, make_result
 
 QUESTION = answers.question_digest(room_map(), room_map())
 

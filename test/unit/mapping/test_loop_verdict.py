@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResu
 from uw_dslam_ros2.core.registration.rules import first_that_applies
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.settings import SettingsFile
-from uw_dslam_ros2.sim.fleets import make_result
+from uw_dslam_ros2.sim.maps.fleets import make_result
 
 MATCH = ScanMatch(SE2(), 100.0 * np.eye(3), 0.9, 0.8, 0.5)
 

@@ -14,7 +14,7 @@ from uw_dslam_ros2.core.mapping.section import OpenSection
 from uw_dslam_ros2.core.pose_graph import chained_covariance
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import SonarConfig, detections_from_scan
-from uw_dslam_ros2.sim.world import cast_rays
+from uw_dslam_ros2.sim.waters.world import cast_rays
 
 CONFIG = VehicleMapperConfig(occupancy=OccupancyConfig(resolution_m=0.1)).suited(0.01)
 SPACING = 4.0

@@ -9,7 +9,7 @@ from uw_dslam_ros2.core.merging import (
     SubmapState,
 )
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all
 
 FLEET = three_vehicles()
 IDS = sorted(FLEET.submaps)

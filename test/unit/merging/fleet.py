@@ -4,7 +4,7 @@ import math
 
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import Fleet, line_of_poses, make_walls
+from uw_dslam_ros2.sim.maps.fleets import Fleet, line_of_poses, make_walls
 
 
 def three_vehicles(seed: int = 0, num_submaps: int = 4) -> Fleet:

@@ -13,7 +13,7 @@ from uw_dslam_ros2.core.merging.graph.submap_groups import SubmapGroup
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.sessions.session import load_session, save_session
-from uw_dslam_ros2.sim.fleets import make_result
+from uw_dslam_ros2.sim.maps.fleets import make_result
 
 SIDES = [SubmapGroup((name, 0), {(name, 0): SE2()}, name.encode()) for name in ("auv_1", "auv_2")]
 EVERYWHERE = Query(*SIDES)

@@ -8,7 +8,7 @@ from unit.merging.fleet import map_bytes
 from uw_dslam_ros2.core.merging import MapQueue, SubmapState
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.sim.fleets import (
+from uw_dslam_ros2.sim.maps.fleets import (
     Fleet,
     KnowingMatcher,
     answer_all,

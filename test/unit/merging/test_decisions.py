@@ -33,7 +33,7 @@ from uw_dslam_ros2.core.merging import (
 )
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import answer_all, make_result, refuse
+from uw_dslam_ros2.sim.maps.fleets import answer_all, make_result, refuse
 
 
 @settings(max_examples=200, derandomize=True, deadline=None)

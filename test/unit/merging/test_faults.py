@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.sessions.session import load_session, save_session
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, refuse
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all, refuse
 
 FLEET = three_vehicles()
 CONFIG = MapQueueConfig(anchor_vehicle="auv_1")

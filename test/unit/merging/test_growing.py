@@ -12,7 +12,7 @@ from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
 from uw_dslam_ros2.core.merging.checks.verification import _prior_around
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, lawnmower_fleet, refuse
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all, lawnmower_fleet, refuse
 
 
 def in_turn(fleet):

@@ -9,7 +9,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import GrowingMap, GrowingMapConfig, MapQueue, SubmapState
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import Fleet, KnowingMatcher, answer_all, make_walls
+from uw_dslam_ros2.sim.maps.fleets import Fleet, KnowingMatcher, answer_all, make_walls
 
 WORLD = make_walls(90.0, 0.25, 3)
 CONFIG = GrowingMapConfig(tile_m=10.0)

@@ -14,7 +14,7 @@ from uw_dslam_ros2.core.merging.steering.decisions import DecisionLog
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.pose_graph import chained_covariance, invert_covariance
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, lawnmower_fleet
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all, lawnmower_fleet
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import dataclasses
 from unit.merging.fleet import three_vehicles
 
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, refuse
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all, refuse
 
 FLEET = three_vehicles()
 PAIRWISE = MapQueueConfig(mode="pairwise")

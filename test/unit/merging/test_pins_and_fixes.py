@@ -25,7 +25,7 @@ from uw_dslam_ros2.core.merging import (
     planning,
 )
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import answer_all
+from uw_dslam_ros2.sim.maps.fleets import answer_all
 
 
 def test_the_frame_goes_where_a_person_pins_it_and_back():

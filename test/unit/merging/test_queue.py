@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.merging.graph.solving import loop_errors
 from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all, lawnmower_fleet, refuse
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all, lawnmower_fleet, refuse
 
 FLEET = three_vehicles()
 IDS = sorted(FLEET.submaps)

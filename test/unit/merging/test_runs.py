@@ -8,7 +8,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track, track_name
-from uw_dslam_ros2.sim.fleets import (
+from uw_dslam_ros2.sim.maps.fleets import (
     Fleet,
     KnowingMatcher,
     answer_all,

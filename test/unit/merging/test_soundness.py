@@ -24,7 +24,7 @@ from uw_dslam_ros2.core.merging.types import Edge
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId, Track
-from uw_dslam_ros2.sim.fleets import (
+from uw_dslam_ros2.sim.maps.fleets import (
     Fleet,
     KnowingMatcher,
     answer_all,

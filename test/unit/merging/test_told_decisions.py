@@ -21,7 +21,7 @@ from uw_dslam_ros2.core.merging.steering.decision_bytes import read_decision, wr
 from uw_dslam_ros2.core.merging.steering.told_decisions import ToldDecisions
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all
 
 ONE, OTHER, THIRD = (SubmapId(f"auv_{k}", 4_000_000_000 + k, 3 * k) for k in (1, 2, 3))
 ANN = {"who": "Ann", "stamp_ns": 1_764_230_400_123_000_000}

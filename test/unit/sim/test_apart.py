@@ -11,14 +11,14 @@ from uw_dslam_ros2.core.grid import FREE, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.mapping import OccupancyConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.metrics import align_points
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.apart import ApartMap, apart_pair, different_pair, make_apart_map
-from uw_dslam_ros2.sim.map_pairs import is_right, pair_errors
-from uw_dslam_ros2.sim.mapped import MappedRun, map_run
-from uw_dslam_ros2.sim.mission import plan_mission, tiny_mission_config
-from uw_dslam_ros2.sim.places import make_canal, make_harbour, make_lake, make_symmetric
-from uw_dslam_ros2.sim.raster import grid_over, wall_mask
-from uw_dslam_ros2.sim.seasons import another_season, loose_objects
-from uw_dslam_ros2.sim.world import Surface, WorldBuilder
+from uw_dslam_ros2.sim.maps.apart import ApartMap, apart_pair, different_pair, make_apart_map
+from uw_dslam_ros2.sim.maps.pairs import is_right, pair_errors
+from uw_dslam_ros2.sim.missions.mapped import MappedRun, map_run
+from uw_dslam_ros2.sim.missions.mission import plan_mission, tiny_mission_config
+from uw_dslam_ros2.sim.waters.places import make_canal, make_harbour, make_lake, make_symmetric
+from uw_dslam_ros2.sim.waters.raster import grid_over, wall_mask
+from uw_dslam_ros2.sim.waters.seasons import another_season, loose_objects
+from uw_dslam_ros2.sim.waters.world import Surface, WorldBuilder
 
 _MAPPER = VehicleMapperConfig(occupancy=OccupancyConfig(resolution_m=0.2))
 

@@ -1,7 +1,7 @@
 import numpy as np
 
-from uw_dslam_ros2.sim.clutter import ClutterConfig, MovingClutter
-from uw_dslam_ros2.sim.places import make_place
+from uw_dslam_ros2.sim.waters.clutter import ClutterConfig, MovingClutter
+from uw_dslam_ros2.sim.waters.places import make_place
 
 WORLD = make_place("harbour", 0)
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.instruments import InstrumentConfig, measure, steel_deflection
-from uw_dslam_ros2.sim.vehicle import DriveConfig, drive
-from uw_dslam_ros2.sim.world import Surface, WorldBuilder
+from uw_dslam_ros2.sim.vehicles.instruments import InstrumentConfig, measure, steel_deflection
+from uw_dslam_ros2.sim.vehicles.vehicle import DriveConfig, drive
+from uw_dslam_ros2.sim.waters.world import Surface, WorldBuilder
 
 PERFECT = InstrumentConfig(
     yaw_noise_rad=0.0,

@@ -3,8 +3,8 @@ from unit.merging.fleet import map_bytes, three_vehicles
 
 from uw_dslam_ros2.core.link.transport.channel import ChannelConfig
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
-from uw_dslam_ros2.sim.fleets import KnowingMatcher, answer_all
-from uw_dslam_ros2.sim.link_mission import run_link
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all
+from uw_dslam_ros2.sim.missions.link_mission import run_link
 
 
 def queue_of(events, fleet, is_growing):

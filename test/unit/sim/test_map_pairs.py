@@ -8,8 +8,8 @@ import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN
-from uw_dslam_ros2.sim.floor_plans import PLACE_KINDS, make_place
-from uw_dslam_ros2.sim.map_pairs import MapNoise, damage, make_pair, observe
+from uw_dslam_ros2.sim.maps.floor_plans import PLACE_KINDS, make_place
+from uw_dslam_ros2.sim.maps.pairs import MapNoise, damage, make_pair, observe
 
 pytestmark = pytest.mark.kernels
 

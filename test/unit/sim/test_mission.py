@@ -10,7 +10,7 @@ from uw_dslam_ros2.core.mounting import StaticFrames, fan_mount
 from uw_dslam_ros2.io.bags import ImageEvent, ImuEvent, TransformEvent, TruthEvent, read_events
 from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.trajectories import read_tum
-from uw_dslam_ros2.sim.mission import (
+from uw_dslam_ros2.sim.missions.mission import (
     T_BASE_DVL,
     T_BASE_SONAR,
     MissionConfig,
@@ -18,8 +18,8 @@ from uw_dslam_ros2.sim.mission import (
     plan_mission,
     tiny_mission_config,
 )
-from uw_dslam_ros2.sim.raster import grid_over, seen_map
-from uw_dslam_ros2.sim.recording import read_mission, simulate_mission
+from uw_dslam_ros2.sim.missions.recording import read_mission, simulate_mission
+from uw_dslam_ros2.sim.waters.raster import grid_over, seen_map
 
 SHORT = replace(tiny_mission_config(), duration_s=4.0, truth_resolution_m=0.5)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.sim.paths import SurveyArea, plan_survey, split_areas
-from uw_dslam_ros2.sim.places import make_place
+from uw_dslam_ros2.sim.vehicles.paths import SurveyArea, plan_survey, split_areas
+from uw_dslam_ros2.sim.waters.places import make_place
 
 
 @pytest.mark.parametrize("place", ["harbour", "lake"])

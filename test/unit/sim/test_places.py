@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.sim.places import PLACES, make_place
+from uw_dslam_ros2.sim.waters.places import PLACES, make_place
 
 
 @pytest.mark.parametrize("place", PLACES)

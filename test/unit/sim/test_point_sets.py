@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.sim.point_sets import outlier_problem, overlap_problem, unrelated_problem
+from uw_dslam_ros2.sim.maps.point_sets import outlier_problem, overlap_problem, unrelated_problem
 
 
 @pytest.mark.parametrize(

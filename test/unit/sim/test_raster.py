@@ -5,8 +5,8 @@ import pytest
 
 from uw_dslam_ros2.core.grid import GridSpec
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.raster import grid_over, seen_map, wall_mask
-from uw_dslam_ros2.sim.world import Surface, WorldBuilder
+from uw_dslam_ros2.sim.waters.raster import grid_over, seen_map, wall_mask
+from uw_dslam_ros2.sim.waters.world import Surface, WorldBuilder
 
 pytestmark = pytest.mark.kernels
 

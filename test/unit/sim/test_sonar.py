@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.clutter import Scatterers
-from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
-from uw_dslam_ros2.sim.speckle import speckle_statistics
-from uw_dslam_ros2.sim.world import Surface, WorldBuilder
+from uw_dslam_ros2.sim.sonars.imaging import SonarConfig, SonarSimulator
+from uw_dslam_ros2.sim.sonars.speckle import speckle_statistics
+from uw_dslam_ros2.sim.waters.clutter import Scatterers
+from uw_dslam_ros2.sim.waters.world import Surface, WorldBuilder
 
 pytestmark = pytest.mark.kernels
 

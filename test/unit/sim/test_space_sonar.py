@@ -9,11 +9,11 @@ import pytest
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.feeding import feed
 from uw_dslam_ros2.io.readings import PointsEvent
-from uw_dslam_ros2.sim.mission import tiny_mission_config
-from uw_dslam_ros2.sim.recording import simulate_mission
-from uw_dslam_ros2.sim.space_sonar import SpaceSonarConfig, SpaceSonarSimulator
-from uw_dslam_ros2.sim.sway import fan_in_space, rotation_level_base
-from uw_dslam_ros2.sim.world import Surface, WorldBuilder
+from uw_dslam_ros2.sim.missions.mission import tiny_mission_config
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
+from uw_dslam_ros2.sim.sonars.space_sonar import SpaceSonarConfig, SpaceSonarSimulator
+from uw_dslam_ros2.sim.vehicles.sway import fan_in_space, rotation_level_base
+from uw_dslam_ros2.sim.waters.world import Surface, WorldBuilder
 
 pytestmark = pytest.mark.kernels
 

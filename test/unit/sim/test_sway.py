@@ -11,11 +11,16 @@ from scipy.spatial.transform import Rotation
 from uw_dslam_ros2.core.mounting import fan_mount
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.interfaces import make_typestore
-from uw_dslam_ros2.sim.mission import PingMaker, plan_mission, tiny_mission_config
-from uw_dslam_ros2.sim.recording import simulate_mission
-from uw_dslam_ros2.sim.sonar import Intruder, SonarConfig, SonarSimulator
-from uw_dslam_ros2.sim.sway import SwayConfig, body_rates, fan_in_space, rotation_level_base
-from uw_dslam_ros2.sim.world import Surface, WorldBuilder
+from uw_dslam_ros2.sim.missions.mission import PingMaker, plan_mission, tiny_mission_config
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
+from uw_dslam_ros2.sim.sonars.imaging import Intruder, SonarConfig, SonarSimulator
+from uw_dslam_ros2.sim.vehicles.sway import (
+    SwayConfig,
+    body_rates,
+    fan_in_space,
+    rotation_level_base,
+)
+from uw_dslam_ros2.sim.waters.world import Surface, WorldBuilder
 
 pytestmark = pytest.mark.kernels
 

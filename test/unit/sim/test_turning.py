@@ -8,9 +8,9 @@ import pytest
 
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.recordings import open_bag
-from uw_dslam_ros2.sim.mission import T_BASE_SONAR, plan_mission, tiny_mission_config
-from uw_dslam_ros2.sim.recording import simulate_mission
-from uw_dslam_ros2.sim.turning import TurningSonarConfig, beam_bearing_rad, counted_rad
+from uw_dslam_ros2.sim.missions.mission import T_BASE_SONAR, plan_mission, tiny_mission_config
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
+from uw_dslam_ros2.sim.sonars.turning import TurningSonarConfig, beam_bearing_rad, counted_rad
 
 TURNING = TurningSonarConfig(turn_s=4.0, num_beams=50, num_ranges=300)
 CONFIG = replace(

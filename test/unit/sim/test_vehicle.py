@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.sim.vehicle import DriveConfig, drive
+from uw_dslam_ros2.sim.vehicles.vehicle import DriveConfig, drive
 
 STILL = DriveConfig(current_m_s=0.0)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.sim.world import NO_HIT, Surface, WorldBuilder, cast_rays
+from uw_dslam_ros2.sim.waters.world import NO_HIT, Surface, WorldBuilder, cast_rays
 
 pytestmark = pytest.mark.kernels
 

@@ -38,8 +38,8 @@ from uw_dslam_ros2.core.merging import MapQueueConfig
 from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
 from uw_dslam_ros2.io.sessions.session import SESSION_FOLDER, load_session
 from uw_dslam_ros2.io.settings import SettingsFile
-from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
-from uw_dslam_ros2.sim.recording import simulate_mission
+from uw_dslam_ros2.sim.missions.mission import SONAR_KINDS, MissionConfig
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
 
 __all__ = ["main"]
 

@@ -12,12 +12,12 @@ from pathlib import Path
 from tqdm import tqdm
 
 from uw_dslam_ros2.core.errors import UwDslamError
-from uw_dslam_ros2.sim.instruments import HEADING_SOURCES
-from uw_dslam_ros2.sim.mission import ALL_SONAR_KINDS, MissionConfig
-from uw_dslam_ros2.sim.places import PLACES
-from uw_dslam_ros2.sim.recording import simulate_mission
-from uw_dslam_ros2.sim.sway import SwayConfig
-from uw_dslam_ros2.sim.turning import TURNING_MESSAGES
+from uw_dslam_ros2.sim.missions.mission import ALL_SONAR_KINDS, MissionConfig
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
+from uw_dslam_ros2.sim.sonars.turning import TURNING_MESSAGES
+from uw_dslam_ros2.sim.vehicles.instruments import HEADING_SOURCES
+from uw_dslam_ros2.sim.vehicles.sway import SwayConfig
+from uw_dslam_ros2.sim.waters.places import PLACES
 
 __all__ = ["main"]
 

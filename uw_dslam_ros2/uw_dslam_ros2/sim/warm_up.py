@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.raster import grid_over, seen_map
-from uw_dslam_ros2.sim.sonar import SonarConfig, SonarSimulator
-from uw_dslam_ros2.sim.world import Surface, WorldBuilder
+from uw_dslam_ros2.sim.sonars.imaging import SonarConfig, SonarSimulator
+from uw_dslam_ros2.sim.waters.raster import grid_over, seen_map
+from uw_dslam_ros2.sim.waters.world import Surface, WorldBuilder
 
 __all__ = ["warm_up"]
 

@@ -28,7 +28,7 @@ from uw_dslam_ros2.core.registration.baselines.correlative import _pyramid
 from uw_dslam_ros2.core.registration.baselines.ndt import _cells, _derivatives
 from uw_dslam_ros2.core.registration.baselines.peers import _flattened, _lifted
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.point_sets import outlier_problem, overlap_problem
+from uw_dslam_ros2.sim.maps.point_sets import outlier_problem, overlap_problem
 
 pytestmark = pytest.mark.kernels
 

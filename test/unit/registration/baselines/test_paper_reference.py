@@ -19,7 +19,7 @@ from uw_dslam_ros2.core.registration.baselines.paper_reference import (
     upper_bound,
 )
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.point_sets import outlier_problem
+from uw_dslam_ros2.sim.maps.point_sets import outlier_problem
 
 
 def random_pair(rng, num_source=5, num_target=7, is_density=False):

@@ -9,7 +9,7 @@ from uw_dslam_ros2.core.features.grid_filter import clean_cells
 from uw_dslam_ros2.core.registration.grids.judging import agreement_kernels
 from uw_dslam_ros2.core.registration.grids.judging.agreement import WallMap, measure_agreement
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import make_pair
+from uw_dslam_ros2.sim.maps.pairs import make_pair
 
 pytestmark = pytest.mark.kernels
 

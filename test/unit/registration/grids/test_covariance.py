@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.registration.grids.judging.covariance import (
 )
 from uw_dslam_ros2.core.registration.grids.problem import GridProblem, build_problem
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
-from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
+from uw_dslam_ros2.sim.maps.pairs import MapPair, make_pair
 
 _SIGMA_CELLS = 2.0
 _NUM_DEGREES = 3.0  # of freedom: the expectation of a NEES

@@ -7,8 +7,8 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.grids.crop import crop_to_known, turn_to_own_axes
 from uw_dslam_ros2.core.registration.grids.register import register_grids
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import make_pair
-from uw_dslam_ros2.sim.map_variants import turned
+from uw_dslam_ros2.sim.maps.pairs import make_pair
+from uw_dslam_ros2.sim.maps.variants import turned
 
 
 def _on_canvas(occupancy: OccupancyMap, left: int, below: int, side: int) -> OccupancyMap:

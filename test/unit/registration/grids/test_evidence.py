@@ -28,7 +28,7 @@ from uw_dslam_ros2.core.registration.grids.problem import build_problem
 from uw_dslam_ros2.core.registration.grids.register import match_evidence, register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import is_right, make_pair
+from uw_dslam_ros2.sim.maps.pairs import is_right, make_pair
 
 
 def _line(start, end, count=100):

@@ -9,8 +9,8 @@ from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
 from uw_dslam_ros2.core.registration.result import Verdict
-from uw_dslam_ros2.sim.map_pairs import make_pair, pair_errors
-from uw_dslam_ros2.sim.map_variants import VARIANTS, mirrored
+from uw_dslam_ros2.sim.maps.pairs import make_pair, pair_errors
+from uw_dslam_ros2.sim.maps.variants import VARIANTS, mirrored
 
 _TRIES = ((0.7, "noisy", True), (0.5, "clean", True), (0.5, "noisy", False))
 _PAIRS = [

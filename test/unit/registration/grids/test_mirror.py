@@ -16,8 +16,8 @@ from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.preparation import in_a_mirror, prepare_maps
 from uw_dslam_ros2.core.registration.grids.register import match_evidence, register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, Verdict
-from uw_dslam_ros2.sim.map_pairs import make_pair
-from uw_dslam_ros2.sim.map_variants import mirrored
+from uw_dslam_ros2.sim.maps.pairs import make_pair
+from uw_dslam_ros2.sim.maps.variants import mirrored
 
 _CONFIG = GridRegistrationConfig()
 

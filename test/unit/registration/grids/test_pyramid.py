@@ -12,7 +12,7 @@ from uw_dslam_ros2.core.registration.grids.finding.landscape import Landscape
 from uw_dslam_ros2.core.registration.grids.finding.search import whole_plane
 from uw_dslam_ros2.core.registration.grids.preparation import prepare_maps
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
-from uw_dslam_ros2.sim.map_pairs import MapPair, cut_pair, is_right
+from uw_dslam_ros2.sim.maps.pairs import MapPair, cut_pair, is_right
 
 
 def _thin_walled_place(size: int, spacing: int, rng: np.random.Generator) -> np.ndarray:

@@ -10,7 +10,7 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, Progress, Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import MapPair, make_pair
+from uw_dslam_ros2.sim.maps.pairs import MapPair, make_pair
 
 
 def _errors(pair: MapPair, T_target_source: SE2) -> tuple[float, float]:

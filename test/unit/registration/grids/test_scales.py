@@ -11,8 +11,8 @@ from uw_dslam_ros2.core.registration.grids.judging.agreement import WallMap, mea
 from uw_dslam_ros2.core.registration.grids.judging.probability import probability_of
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import MapNoise, MapPair, damage, is_right, make_pair
-from uw_dslam_ros2.sim.map_variants import VARIANTS
+from uw_dslam_ros2.sim.maps.pairs import MapNoise, MapPair, damage, is_right, make_pair
+from uw_dslam_ros2.sim.maps.variants import VARIANTS
 
 
 def _bent(occupancy: OccupancyMap, bend_cells: float, seed: int) -> OccupancyMap:

@@ -15,14 +15,14 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.atomic import write_files
-from uw_dslam_ros2.sim.apart import (
+from uw_dslam_ros2.sim.maps.apart import (
     ApartMap,
     apart_pair,
     different_pair,
     make_apart_map,
 )
-from uw_dslam_ros2.sim.map_pairs import MapPair
-from uw_dslam_ros2.sim.mapped import MappedRun
+from uw_dslam_ros2.sim.maps.pairs import MapPair
+from uw_dslam_ros2.sim.missions.mapped import MappedRun
 
 __all__ = ["apart_maps", "different_pairs", "kind_of", "matching_pairs", "twin_pairs"]
 

@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.registration.points.evidence import EvidenceModel, Outli
 from uw_dslam_ros2.core.registration.points.input import Pair, cloud_of
 from uw_dslam_ros2.core.registration.points.refine import PointModel, fit_known
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.point_sets import PointSetProblem
+from uw_dslam_ros2.sim.maps.point_sets import PointSetProblem
 
 __all__ = ["best_with_known_noise"]
 

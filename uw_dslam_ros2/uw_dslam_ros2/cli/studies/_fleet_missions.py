@@ -16,9 +16,9 @@ from uw_dslam_ros2.io.maps.files import write_map
 from uw_dslam_ros2.io.sessions.session import load_session, save_session
 from uw_dslam_ros2.io.trajectories import write_tum
 from uw_dslam_ros2.io.vehicles import recordings_of
-from uw_dslam_ros2.sim.mission import MissionConfig
-from uw_dslam_ros2.sim.recording import simulate_mission
-from uw_dslam_ros2.sim.sonar import SonarConfig
+from uw_dslam_ros2.sim.missions.mission import MissionConfig
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
+from uw_dslam_ros2.sim.sonars.imaging import SonarConfig
 
 __all__ = ["FleetMission", "code_digest", "demo_mission", "mapped_bags", "simulated_mission"]
 

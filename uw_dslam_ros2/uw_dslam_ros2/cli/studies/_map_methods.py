@@ -26,7 +26,7 @@ from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import MapPair, is_right
+from uw_dslam_ros2.sim.maps.pairs import MapPair, is_right
 
 __all__ = ["MAP_METHODS", "add_method_arguments", "at_one_resolution", "compare"]
 

@@ -14,7 +14,7 @@ from uw_dslam_ros2.cli.studies._common import share_interval
 from uw_dslam_ros2.core.registration.grids.register import register_grids
 from uw_dslam_ros2.core.registration.result import PriorWindow, RegistrationResult
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
-from uw_dslam_ros2.sim.map_pairs import MapPair, is_right, make_pair, pair_errors
+from uw_dslam_ros2.sim.maps.pairs import MapPair, is_right, make_pair, pair_errors
 
 __all__ = [
     "SHARES",

@@ -12,7 +12,7 @@ from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps.files import read_map
-from uw_dslam_ros2.sim.map_pairs import MapPair
+from uw_dslam_ros2.sim.maps.pairs import MapPair
 
 __all__ = ["PAIR_COLUMNS", "ListedPair", "read_pairs"]
 

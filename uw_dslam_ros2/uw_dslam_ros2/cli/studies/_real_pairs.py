@@ -15,7 +15,7 @@ from uw_dslam_ros2.cli.studies._common import data_dir
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.datasets.aracati2017 import AracatiRecording, read_aracati2017
-from uw_dslam_ros2.sim.map_pairs import MapPair
+from uw_dslam_ros2.sim.maps.pairs import MapPair
 
 __all__ = ["has_recording", "real_pairs"]
 

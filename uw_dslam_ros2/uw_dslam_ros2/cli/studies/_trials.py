@@ -22,7 +22,7 @@ from uw_dslam_ros2.core.registration.baselines import icp, point_baselines, proc
 from uw_dslam_ros2.core.registration.search.branch_and_bound import SearchSettings, Term, search
 from uw_dslam_ros2.core.registration.search.field import mixture_field
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem, overlap_problem
+from uw_dslam_ros2.sim.maps.point_sets import PointSetProblem, outlier_problem, overlap_problem
 
 __all__ = [
     "CEILING",

@@ -21,9 +21,9 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
     pose_features,
 )
 from uw_dslam_ros2.core.registration.grids.register import match_evidence
-from uw_dslam_ros2.sim.apart import ApartMap
-from uw_dslam_ros2.sim.map_pairs import MapPair, is_right
-from uw_dslam_ros2.sim.map_variants import mirrored
+from uw_dslam_ros2.sim.maps.apart import ApartMap
+from uw_dslam_ros2.sim.maps.pairs import MapPair, is_right
+from uw_dslam_ros2.sim.maps.variants import mirrored
 
 __all__ = [
     "Task",

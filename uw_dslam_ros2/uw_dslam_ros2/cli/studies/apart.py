@@ -35,7 +35,7 @@ from uw_dslam_ros2.cli.studies._common import (
 from uw_dslam_ros2.cli.studies._map_methods import add_method_arguments, compare
 from uw_dslam_ros2.cli.studies._map_pairs import registered
 from uw_dslam_ros2.core.errors import DataError
-from uw_dslam_ros2.sim.map_pairs import MapPair
+from uw_dslam_ros2.sim.maps.pairs import MapPair
 
 Row = dict[str, Any]
 

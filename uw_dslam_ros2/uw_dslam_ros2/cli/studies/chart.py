@@ -39,15 +39,15 @@ from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.trajectories import read_tum
 from uw_dslam_ros2.io.vehicles import find_recordings
-from uw_dslam_ros2.sim.mission import (
+from uw_dslam_ros2.sim.missions.mission import (
     T_BASE_SONAR,
     Mission,
     MissionConfig,
     VehicleRun,
     plan_mission,
 )
-from uw_dslam_ros2.sim.places import PLACES
-from uw_dslam_ros2.sim.recording import simulate_mission
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
+from uw_dslam_ros2.sim.waters.places import PLACES
 
 __all__ = ["add_arguments", "run"]
 

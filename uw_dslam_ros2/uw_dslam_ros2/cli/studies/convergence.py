@@ -36,7 +36,7 @@ from uw_dslam_ros2.core.registration.search.branch_and_bound import (
     search,
 )
 from uw_dslam_ros2.core.registration.search.field import mixture_field
-from uw_dslam_ros2.sim.point_sets import PointSetProblem, outlier_problem
+from uw_dslam_ros2.sim.maps.point_sets import PointSetProblem, outlier_problem
 
 __all__ = ["add_arguments", "run"]
 

@@ -24,11 +24,11 @@ from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.sonar import SonarConfig
 from uw_dslam_ros2.io.examining import examine_readings
 from uw_dslam_ros2.io.readings import ImageEvent, Reading
-from uw_dslam_ros2.sim.instruments import InstrumentConfig
-from uw_dslam_ros2.sim.mission import MissionConfig, plan_mission
-from uw_dslam_ros2.sim.places import PLACES
-from uw_dslam_ros2.sim.readings import MissionReadings, mounting_of
-from uw_dslam_ros2.sim.sonar import SonarConfig as SimulatedSonar
+from uw_dslam_ros2.sim.missions.mission import MissionConfig, plan_mission
+from uw_dslam_ros2.sim.missions.readings import MissionReadings, mounting_of
+from uw_dslam_ros2.sim.sonars.imaging import SonarConfig as SimulatedSonar
+from uw_dslam_ros2.sim.vehicles.instruments import InstrumentConfig
+from uw_dslam_ros2.sim.waters.places import PLACES
 
 __all__ = ["add_arguments", "examined", "run"]
 

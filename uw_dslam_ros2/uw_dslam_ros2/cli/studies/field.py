@@ -35,7 +35,7 @@ from uw_dslam_ros2.core.registration.baselines.ndt import ndt
 from uw_dslam_ros2.core.registration.baselines.orb_ransac import orb_ransac
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, register_grids
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import MapPair, is_right, pair_errors
+from uw_dslam_ros2.sim.maps.pairs import MapPair, is_right, pair_errors
 
 Row = dict[str, Any]
 Method = Callable[[MapPair], SE2 | None]

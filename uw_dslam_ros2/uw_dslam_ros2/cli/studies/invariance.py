@@ -19,8 +19,8 @@ from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfig, match_evidence
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import MapPair, pair_errors
-from uw_dslam_ros2.sim.map_variants import VARIANTS, coarser_pair, mirrored
+from uw_dslam_ros2.sim.maps.pairs import MapPair, pair_errors
+from uw_dslam_ros2.sim.maps.variants import VARIANTS, coarser_pair, mirrored
 
 Row = dict[str, Any]
 Changes = dict[str, Callable[[MapPair], MapPair]]

@@ -31,7 +31,7 @@ from uw_dslam_ros2.cli.studies.merging import merged_largest, placing_error
 from uw_dslam_ros2.core.link import Layer, LayeredSubmap, encode_submap
 from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig
 from uw_dslam_ros2.core.submap import Submap
-from uw_dslam_ros2.sim.link_mission import LinkRun, run_link
+from uw_dslam_ros2.sim.missions.link_mission import LinkRun, run_link
 
 __all__ = ["add_arguments", "run"]
 

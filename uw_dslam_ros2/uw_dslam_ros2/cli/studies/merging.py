@@ -60,8 +60,8 @@ from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags
-from uw_dslam_ros2.sim.fleets import answer_all, known_overlap, make_result
-from uw_dslam_ros2.sim.places import PLACES
+from uw_dslam_ros2.sim.maps.fleets import answer_all, known_overlap, make_result
+from uw_dslam_ros2.sim.waters.places import PLACES
 
 __all__ = ["add_arguments", "merged_largest", "placing_error", "run"]
 

@@ -37,7 +37,7 @@ from uw_dslam_ros2.core.registration import (
 from uw_dslam_ros2.core.registration.points.nnde import nnde_density
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.datasets.freiburg import LaserLog, read_carmen_log
-from uw_dslam_ros2.sim.point_sets import outlier_problem
+from uw_dslam_ros2.sim.maps.point_sets import outlier_problem
 
 __all__ = ["add_arguments", "run"]
 

@@ -26,7 +26,7 @@ from uw_dslam_ros2.cli.studies._common import (
 )
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, MatchRequest
 from uw_dslam_ros2.core.registration import RegistrationResult, register_grids
-from uw_dslam_ros2.sim.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
+from uw_dslam_ros2.sim.maps.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
 
 __all__ = ["add_arguments", "run"]
 

@@ -30,7 +30,7 @@ from uw_dslam_ros2.cli.studies._map_pairs import (
     shares,
 )
 from uw_dslam_ros2.cli.studies._real_pairs import has_recording, real_pairs
-from uw_dslam_ros2.sim.map_pairs import MapPair
+from uw_dslam_ros2.sim.maps.pairs import MapPair
 
 Row = dict[str, Any]
 _FIRST_SEED = 2000  # others than those of `study verdict`

@@ -47,9 +47,9 @@ from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.trajectories import read_tum
-from uw_dslam_ros2.sim.mission import SONAR_KINDS, MissionConfig
-from uw_dslam_ros2.sim.places import PLACES
-from uw_dslam_ros2.sim.recording import simulate_mission
+from uw_dslam_ros2.sim.missions.mission import SONAR_KINDS, MissionConfig
+from uw_dslam_ros2.sim.missions.recording import simulate_mission
+from uw_dslam_ros2.sim.waters.places import PLACES
 
 __all__ = ["add_arguments", "run"]
 

@@ -26,10 +26,10 @@ from uw_dslam_ros2.cli.studies._common import (
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar import Detections, SonarConfig, SonarImage, detect
-from uw_dslam_ros2.sim.sonar import SonarConfig as SimulatedSonar
-from uw_dslam_ros2.sim.sonar import SonarSimulator
-from uw_dslam_ros2.sim.speckle import speckle_of, speckle_statistics
-from uw_dslam_ros2.sim.world import Surface, WorldBuilder
+from uw_dslam_ros2.sim.sonars.imaging import SonarConfig as SimulatedSonar
+from uw_dslam_ros2.sim.sonars.imaging import SonarSimulator
+from uw_dslam_ros2.sim.sonars.speckle import speckle_of, speckle_statistics
+from uw_dslam_ros2.sim.waters.world import Surface, WorldBuilder
 
 __all__ = ["add_arguments", "run"]
 

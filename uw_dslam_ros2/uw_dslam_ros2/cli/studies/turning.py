@@ -20,11 +20,11 @@ from typing import Any
 from uw_dslam_ros2.cli import doctor, offline
 from uw_dslam_ros2.cli.studies._common import print_table, progress, write_csv
 from uw_dslam_ros2.core.errors import DataError
-from uw_dslam_ros2.sim.instruments import InstrumentConfig
-from uw_dslam_ros2.sim.mission import MissionConfig
-from uw_dslam_ros2.sim.recording import RecordedMission, simulate_mission
-from uw_dslam_ros2.sim.turning import TURNING_MESSAGES, TurningSonarConfig
-from uw_dslam_ros2.sim.vehicle import DriveConfig
+from uw_dslam_ros2.sim.missions.mission import MissionConfig
+from uw_dslam_ros2.sim.missions.recording import RecordedMission, simulate_mission
+from uw_dslam_ros2.sim.sonars.turning import TURNING_MESSAGES, TurningSonarConfig
+from uw_dslam_ros2.sim.vehicles.instruments import InstrumentConfig
+from uw_dslam_ros2.sim.vehicles.vehicle import DriveConfig
 
 __all__ = ["add_arguments", "mission_config", "run"]
 

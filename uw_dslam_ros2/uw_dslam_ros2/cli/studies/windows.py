@@ -29,7 +29,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.maps.files import read_map
-from uw_dslam_ros2.sim.map_pairs import NOISES, MapPair, cut_pair, cut_window, windows_about
+from uw_dslam_ros2.sim.maps.pairs import NOISES, MapPair, cut_pair, cut_window, windows_about
 
 Row = dict[str, Any]
 Values = NDArray[np.int8]

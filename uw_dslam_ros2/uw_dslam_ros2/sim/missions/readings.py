@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.mounting import rotation_of_quaternion
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.readings import ImageEvent, ImuEvent, Reading, VelocityEvent
-from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, Mission, PingMaker
+from uw_dslam_ros2.sim.missions.mission import T_BASE_DVL, T_BASE_SONAR, Mission, PingMaker
 
 __all__ = ["MissionReadings", "mounting_of"]
 

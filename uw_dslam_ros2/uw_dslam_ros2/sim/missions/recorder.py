@@ -15,16 +15,16 @@ from uw_dslam_ros2.core.sonar.detect import image_echoes
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.recordings import BagWriter
-from uw_dslam_ros2.sim.mission import (
+from uw_dslam_ros2.sim.missions.mission import (
     SONAR_HEIGHT_M,
     T_BASE_DVL,
     T_BASE_SONAR,
     Mission,
     VehicleRun,
 )
-from uw_dslam_ros2.sim.space_sonar import SpacePing
-from uw_dslam_ros2.sim.sway import body_rates, rotation_level_base
-from uw_dslam_ros2.sim.turning import counted_rad
+from uw_dslam_ros2.sim.sonars.space_sonar import SpacePing
+from uw_dslam_ros2.sim.sonars.turning import counted_rad
+from uw_dslam_ros2.sim.vehicles.sway import body_rates, rotation_level_base
 
 __all__ = ["TRUTH_STEP", "VehicleRecorder"]
 

@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import SonarImage
-from uw_dslam_ros2.sim.clutter import ClutterConfig, MovingClutter
-from uw_dslam_ros2.sim.instruments import InstrumentConfig, NavigationLog, measure
-from uw_dslam_ros2.sim.paths import SurveyArea, plan_survey, split_areas
-from uw_dslam_ros2.sim.places import PLACES, make_place
-from uw_dslam_ros2.sim.sonar import Intruder, SonarConfig, SonarSimulator
-from uw_dslam_ros2.sim.sonar_model import power_of_db
-from uw_dslam_ros2.sim.space_sonar import SpacePing, SpaceSonarConfig, SpaceSonarSimulator
-from uw_dslam_ros2.sim.sway import SwayConfig, fan_in_space, rotation_level_base
-from uw_dslam_ros2.sim.turning import (
+from uw_dslam_ros2.sim.sonars.imaging import Intruder, SonarConfig, SonarSimulator
+from uw_dslam_ros2.sim.sonars.model import power_of_db
+from uw_dslam_ros2.sim.sonars.space_sonar import SpacePing, SpaceSonarConfig, SpaceSonarSimulator
+from uw_dslam_ros2.sim.sonars.turning import (
     TurningSonarConfig,
     TurningSonarSimulator,
     beam_bearing_rad,
 )
-from uw_dslam_ros2.sim.vehicle import DriveConfig, Motion, drive
-from uw_dslam_ros2.sim.world import World
+from uw_dslam_ros2.sim.vehicles.instruments import InstrumentConfig, NavigationLog, measure
+from uw_dslam_ros2.sim.vehicles.paths import SurveyArea, plan_survey, split_areas
+from uw_dslam_ros2.sim.vehicles.sway import SwayConfig, fan_in_space, rotation_level_base
+from uw_dslam_ros2.sim.vehicles.vehicle import DriveConfig, Motion, drive
+from uw_dslam_ros2.sim.waters.clutter import ClutterConfig, MovingClutter
+from uw_dslam_ros2.sim.waters.places import PLACES, make_place
+from uw_dslam_ros2.sim.waters.world import World
 
 __all__ = [
     "ALL_SONAR_KINDS",

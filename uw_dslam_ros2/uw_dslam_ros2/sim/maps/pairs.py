@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.floor_plans import BASIN_MARGIN, make_place
+from uw_dslam_ros2.sim.maps.floor_plans import BASIN_MARGIN, make_place
 
 __all__ = [
     "NOISES",

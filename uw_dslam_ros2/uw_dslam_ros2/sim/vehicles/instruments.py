@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.vehicle import Motion
-from uw_dslam_ros2.sim.world import World
+from uw_dslam_ros2.sim.vehicles.vehicle import Motion
+from uw_dslam_ros2.sim.waters.world import World
 
 __all__ = ["HEADING_SOURCES", "InstrumentConfig", "NavigationLog", "measure", "steel_deflection"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.config import Config, setting
-from uw_dslam_ros2.sim.world import World
+from uw_dslam_ros2.sim.waters.world import World
 
 __all__ = ["ClutterConfig", "MovingClutter", "Scatterers"]
 

@@ -19,7 +19,7 @@ from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.maps.files import write_map
 from uw_dslam_ros2.io.recordings import BagWriter
 from uw_dslam_ros2.io.trajectories import write_tum
-from uw_dslam_ros2.sim.mission import (
+from uw_dslam_ros2.sim.missions.mission import (
     T_BASE_SONAR,
     Mission,
     MissionConfig,
@@ -28,9 +28,9 @@ from uw_dslam_ros2.sim.mission import (
     every_metre,
     plan_mission,
 )
-from uw_dslam_ros2.sim.raster import grid_over, seen_map
-from uw_dslam_ros2.sim.recorder import TRUTH_STEP, VehicleRecorder
-from uw_dslam_ros2.sim.space_sonar import SpacePing
+from uw_dslam_ros2.sim.missions.recorder import TRUTH_STEP, VehicleRecorder
+from uw_dslam_ros2.sim.sonars.space_sonar import SpacePing
+from uw_dslam_ros2.sim.waters.raster import grid_over, seen_map
 
 __all__ = ["RecordedMission", "read_mission", "simulate_mission"]
 

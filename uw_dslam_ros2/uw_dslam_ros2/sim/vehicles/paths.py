@@ -12,8 +12,8 @@ from skimage.graph import route_through_array
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec
-from uw_dslam_ros2.sim.raster import grid_over, wall_mask
-from uw_dslam_ros2.sim.world import World
+from uw_dslam_ros2.sim.waters.raster import grid_over, wall_mask
+from uw_dslam_ros2.sim.waters.world import World
 
 __all__ = ["SurveyArea", "plan_survey", "split_areas"]
 

@@ -1,8 +1,8 @@
 """Quick random places as rasters: offices, harbours, lakes, caves, and symmetric ones.
 
 They differ from each other in what makes registration hard (right angles, repetition, curves,
-clutter), and serve studies of the registration only; `uw_dslam_ros2.sim.world` makes the places in
-which vehicles swim.
+clutter), and serve studies of the registration only; `uw_dslam_ros2.sim.waters.places` makes the
+places in which vehicles swim.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.sim.buildings import draw_cellular, draw_corridors, draw_hall, draw_oblique
+from uw_dslam_ros2.sim.maps.buildings import draw_cellular, draw_corridors, draw_hall, draw_oblique
 
 __all__ = ["BASIN_MARGIN", "PLACE_KINDS", "make_place"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.world import World, bounds_of
+from uw_dslam_ros2.sim.waters.world import World, bounds_of
 
 __all__ = ["another_season", "loose_objects"]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig
-from uw_dslam_ros2.sim.mission import T_BASE_DVL, T_BASE_SONAR, Mission, PingMaker
+from uw_dslam_ros2.sim.missions.mission import T_BASE_DVL, T_BASE_SONAR, Mission, PingMaker
 
 __all__ = ["MappedRun", "map_run"]
 

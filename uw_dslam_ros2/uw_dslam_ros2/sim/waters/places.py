@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.sim.world import Surface, World, WorldBuilder, bounds_of
+from uw_dslam_ros2.sim.waters.world import Surface, World, WorldBuilder, bounds_of
 
 __all__ = [
     "PLACES",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.map_pairs import MapPair
+from uw_dslam_ros2.sim.maps.pairs import MapPair
 
 __all__ = [
     "VARIANTS",

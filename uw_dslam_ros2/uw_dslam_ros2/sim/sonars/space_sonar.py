@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.world import World
+from uw_dslam_ros2.sim.waters.world import World
 
 __all__ = ["SpacePing", "SpaceSonarConfig", "SpaceSonarSimulator"]
 

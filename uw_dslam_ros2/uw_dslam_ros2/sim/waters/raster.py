@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.world import World, cast_rays
+from uw_dslam_ros2.sim.waters.world import World, cast_rays
 
 __all__ = ["grid_over", "seen_map", "wall_mask"]
 

@@ -18,18 +18,18 @@ from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, OccupancyMap
 from uw_dslam_ros2.core.mapping import OccupancyConfig, SubmapConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.metrics import align_points
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.sim.clutter import ClutterConfig
-from uw_dslam_ros2.sim.instruments import InstrumentConfig
-from uw_dslam_ros2.sim.map_pairs import MapPair
-from uw_dslam_ros2.sim.mapped import MappedRun, map_run
-from uw_dslam_ros2.sim.mission import Mission, MissionConfig, plan_mission
-from uw_dslam_ros2.sim.paths import SurveyArea
-from uw_dslam_ros2.sim.places import make_canal, make_harbour, make_lake, make_symmetric
-from uw_dslam_ros2.sim.seasons import another_season
-from uw_dslam_ros2.sim.sonar_model import SonarConfig
-from uw_dslam_ros2.sim.turning import TurningSonarConfig
-from uw_dslam_ros2.sim.vehicle import DriveConfig
-from uw_dslam_ros2.sim.world import World
+from uw_dslam_ros2.sim.maps.pairs import MapPair
+from uw_dslam_ros2.sim.missions.mapped import MappedRun, map_run
+from uw_dslam_ros2.sim.missions.mission import Mission, MissionConfig, plan_mission
+from uw_dslam_ros2.sim.sonars.model import SonarConfig
+from uw_dslam_ros2.sim.sonars.turning import TurningSonarConfig
+from uw_dslam_ros2.sim.vehicles.instruments import InstrumentConfig
+from uw_dslam_ros2.sim.vehicles.paths import SurveyArea
+from uw_dslam_ros2.sim.vehicles.vehicle import DriveConfig
+from uw_dslam_ros2.sim.waters.clutter import ClutterConfig
+from uw_dslam_ros2.sim.waters.places import make_canal, make_harbour, make_lake, make_symmetric
+from uw_dslam_ros2.sim.waters.seasons import another_season
+from uw_dslam_ros2.sim.waters.world import World
 
 __all__ = ["APART_KINDS", "ApartMap", "apart_pair", "different_pair", "make_apart_map"]
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.config import Config, setting
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 from uw_dslam_ros2.core.sonar.types import SonarImage
-from uw_dslam_ros2.sim.clutter import Scatterers
-from uw_dslam_ros2.sim.sonar import Intruder, SonarSimulator
-from uw_dslam_ros2.sim.sonar_model import SonarConfig
-from uw_dslam_ros2.sim.world import World
+from uw_dslam_ros2.sim.sonars.imaging import Intruder, SonarSimulator
+from uw_dslam_ros2.sim.sonars.model import SonarConfig
+from uw_dslam_ros2.sim.waters.clutter import Scatterers
+from uw_dslam_ros2.sim.waters.world import World
 
 __all__ = [
     "TURNING_MESSAGES",

@@ -1,6 +1,6 @@
 """Images of a multibeam forward-looking sonar: echoes, seabed, shadows, ghosts, speckle, noise.
 
-The mean echo power of every pixel is summed in linear units (`sonar_model`). Fully developed
+The mean echo power of every pixel is summed in linear units (`model`). Fully developed
 speckle multiplies it, and the display's compression makes 8-bit pixels of it, ``power ** 0.25``:
 real Oculus pings have just those statistics (a coefficient of variation of 0.28 where the scene
 is even).
@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import SonarImage
-from uw_dslam_ros2.sim.clutter import Scatterers
-from uw_dslam_ros2.sim.sonar_kernels import add_echoes, add_seabed, filter_beams
-from uw_dslam_ros2.sim.sonar_model import (
+from uw_dslam_ros2.sim.sonars.kernels import add_echoes, add_seabed, filter_beams
+from uw_dslam_ros2.sim.sonars.model import (
     SonarConfig,
     amplitude_taps,
     beam_response,
@@ -28,7 +27,8 @@ from uw_dslam_ros2.sim.sonar_model import (
     seabed_power,
     seabed_texture,
 )
-from uw_dslam_ros2.sim.world import RayHits, World
+from uw_dslam_ros2.sim.waters.clutter import Scatterers
+from uw_dslam_ros2.sim.waters.world import RayHits, World
 
 __all__ = ["Intruder", "SonarConfig", "SonarSimulator"]
 

@@ -1,0 +1,1 @@
+"""Several vehicles survey one place: in memory, as recordings, through the mapper, over a link."""

@@ -1,0 +1,1 @@
+"""What sonars see: fans, sonars that turn, points in space."""

@@ -1,0 +1,1 @@
+"""Vehicles under way: routes, motion, and what their instruments say."""

@@ -1,0 +1,1 @@
+"""Places seen from above: outlines, what lies in them, what moves, what could be seen."""
