@@ -21,7 +21,7 @@ from pathlib import Path
 
 from harness import emit, require, run_cases
 
-from uw_dslam_ros2.cli.processes import free_domain
+from uw_dslam_ros2.cli.running.processes import free_domain
 from uw_dslam_ros2.ros.plumbing.mission_control import MissionControl
 from uw_dslam_ros2.sim.missions.mission import MissionConfig
 from uw_dslam_ros2.sim.missions.recording import simulate_mission

@@ -25,7 +25,12 @@ setup(
     version="0.1.0",
     packages=find_packages(exclude=["test"]),
     package_data={
-        NAME: ["py.typed", "cli/templates/*", "view/static/*", "view/static/vendor/leaflet/*"]
+        NAME: [
+            "py.typed",
+            "cli/reporting/templates/*",
+            "view/static/*",
+            "view/static/vendor/leaflet/*",
+        ]
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -18,8 +18,8 @@ from std_srvs.srv import Trigger
 from uw_dslam_msgs.msg import MergeStatus, Submap
 from uw_dslam_msgs.srv import SaveSession
 
-from uw_dslam_ros2.cli.mapping import map_recording, settle
-from uw_dslam_ros2.cli.processes import Children
+from uw_dslam_ros2.cli.running.mapping import map_recording, settle
+from uw_dslam_ros2.cli.running.processes import Children
 from uw_dslam_ros2.core.chart.redraw import redrawn
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.merging import MapQueue

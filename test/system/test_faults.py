@@ -15,7 +15,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from uw_dslam_msgs.msg import MergeStatus
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
-from uw_dslam_ros2.cli.processes import Children
+from uw_dslam_ros2.cli.running.processes import Children
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.sessions.session import load_session
 from uw_dslam_ros2.ros.convert.core_types import submap_to_msg

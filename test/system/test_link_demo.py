@@ -4,9 +4,9 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from uw_dslam_ros2.cli.demo_link import LinkedMission, run_linked
-from uw_dslam_ros2.cli.link_report import add_maps
-from uw_dslam_ros2.cli.scoring import read_truth
+from uw_dslam_ros2.cli.reporting.link_report import add_maps
+from uw_dslam_ros2.cli.reporting.scoring import read_truth
+from uw_dslam_ros2.cli.running.demo_link import LinkedMission, run_linked
 from uw_dslam_ros2.core.merging import MapQueueConfig
 from uw_dslam_ros2.sim.missions.mission import tiny_mission_config
 from uw_dslam_ros2.sim.missions.recording import simulate_mission

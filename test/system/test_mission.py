@@ -23,7 +23,7 @@ from tf2_msgs.msg import TFMessage
 from uw_dslam_msgs.msg import MergeStatus, Submap
 from uw_dslam_msgs.srv import SaveMap, SaveSession
 
-from uw_dslam_ros2.cli.processes import Children
+from uw_dslam_ros2.cli.running.processes import Children
 from uw_dslam_ros2.core.metrics import compare_maps, trajectory_error
 from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.trajectories import read_tum

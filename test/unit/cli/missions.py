@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
-from uw_dslam_ros2.cli.scoring import Truth
+from uw_dslam_ros2.cli.reporting.outcome import Outcome, outcome_of
+from uw_dslam_ros2.cli.reporting.scoring import Truth
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MapQueue, MatchRequest
 from uw_dslam_ros2.core.registration import RegistrationResult, Verdict

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.cli.charting import chart_tracks, charted
-from uw_dslam_ros2.cli.outcome import outcome_of
+from uw_dslam_ros2.cli.reporting.outcome import outcome_of
+from uw_dslam_ros2.cli.running.charting import chart_tracks, charted
 from uw_dslam_ros2.core.chart import drawing
 from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart
 from uw_dslam_ros2.core.chart.pings import pack_ping

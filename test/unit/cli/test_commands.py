@@ -12,7 +12,7 @@ import pytest
 from unit.cli import missions
 
 from uw_dslam_ros2.cli import common, evaluate, offline, register
-from uw_dslam_ros2.cli.outcome import write_outcome
+from uw_dslam_ros2.cli.reporting.outcome import write_outcome
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.registration import Verdict

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.cli.doctor import main
-from uw_dslam_ros2.cli.mapping import sensor_config
+from uw_dslam_ros2.cli.running.mapping import sensor_config
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.sonar import SonarImage
 from uw_dslam_ros2.io.outgoing import MessageFactory

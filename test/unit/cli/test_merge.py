@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from unit.cli import missions
 
-from uw_dslam_ros2.cli import map_merging, merge, register
+from uw_dslam_ros2.cli import merge, register
+from uw_dslam_ros2.cli.running import map_merging
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import MatchRequest
 from uw_dslam_ros2.core.registration import Verdict

@@ -12,9 +12,14 @@ import numpy as np
 import pytest
 from unit.cli import missions
 
-from uw_dslam_ros2.cli.outcome import RegistrationRow, names_of, outcome_of, write_outcome
-from uw_dslam_ros2.cli.report import RunFacts, render_html
-from uw_dslam_ros2.cli.scoring import score
+from uw_dslam_ros2.cli.reporting.outcome import (
+    RegistrationRow,
+    names_of,
+    outcome_of,
+    write_outcome,
+)
+from uw_dslam_ros2.cli.reporting.report import RunFacts, render_html
+from uw_dslam_ros2.cli.reporting.scoring import score
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.merging.graph.answers import Answer
 from uw_dslam_ros2.core.registration.result import RegistrationResult, Verdict

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from uw_dslam_ros2.cli import processes
-from uw_dslam_ros2.cli.processes import Child, ChildError, Children, free_domain
+from uw_dslam_ros2.cli.running import processes
+from uw_dslam_ros2.cli.running.processes import Child, ChildError, Children, free_domain
 
 MODULE = """
 import pathlib, signal, sys, time

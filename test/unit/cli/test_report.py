@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from unit.cli import missions
 
-from uw_dslam_ros2.cli import map_drawing, pictures
-from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
-from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
-from uw_dslam_ros2.cli.scoring import Scores, Truth, read_truth, score
+from uw_dslam_ros2.cli.reporting import map_drawing, pictures
+from uw_dslam_ros2.cli.reporting.outcome import Outcome, outcome_of
+from uw_dslam_ros2.cli.reporting.report import RunFacts, headline, write_report
+from uw_dslam_ros2.cli.reporting.scoring import Scores, Truth, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging import Decision, DecisionKind

@@ -6,9 +6,9 @@ import json
 import pytest
 from unit.cli import missions
 
-from uw_dslam_ros2.cli.outcome import outcome_of
-from uw_dslam_ros2.cli.report import RunFacts, write_report
-from uw_dslam_ros2.cli.rewriting import has_report, write_anew
+from uw_dslam_ros2.cli.reporting.outcome import outcome_of
+from uw_dslam_ros2.cli.reporting.report import RunFacts, write_report
+from uw_dslam_ros2.cli.reporting.rewriting import has_report, write_anew
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import Decision, DecisionKind
 from uw_dslam_ros2.core.submap import SubmapId

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from uw_dslam_ros2.cli.mapping import OfflineConfig
+from uw_dslam_ros2.cli.running.mapping import OfflineConfig
 
 CONFIG = Path(__file__).resolve().parents[3] / "config"
 

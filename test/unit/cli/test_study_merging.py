@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.cli.scoring import Truth
+from uw_dslam_ros2.cli.reporting.scoring import Truth
 from uw_dslam_ros2.cli.studies import merging
 from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission
 from uw_dslam_ros2.core.merging import MatchRequest

@@ -21,18 +21,18 @@ from uw_dslam_ros2.cli.common import (
     run_command,
     versions,
 )
-from uw_dslam_ros2.cli.demo_link import (
+from uw_dslam_ros2.cli.reporting.link_report import add_maps
+from uw_dslam_ros2.cli.reporting.outcome import outcome_of
+from uw_dslam_ros2.cli.reporting.report import RunFacts, headline, write_report
+from uw_dslam_ros2.cli.reporting.scoring import Scores, Truth, read_truth
+from uw_dslam_ros2.cli.running.demo_link import (
     DEFAULT_LINK_RATE,
     LINK_PRESETS,
     LinkedMission,
     run_linked,
 )
-from uw_dslam_ros2.cli.link_report import add_maps
-from uw_dslam_ros2.cli.mapping import OfflineConfig
-from uw_dslam_ros2.cli.outcome import outcome_of
-from uw_dslam_ros2.cli.processes import Child, Children, free_domain
-from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
-from uw_dslam_ros2.cli.scoring import Scores, Truth, read_truth
+from uw_dslam_ros2.cli.running.mapping import OfflineConfig
+from uw_dslam_ros2.cli.running.processes import Child, Children, free_domain
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import MapQueueConfig
 from uw_dslam_ros2.io.datasets.aracati2017 import read_aracati2017, write_bags

@@ -16,8 +16,8 @@ import yaml
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.common import parser_for, run_command
-from uw_dslam_ros2.cli.mapping import mountings_of, sensor_config
-from uw_dslam_ros2.cli.outcome import json_bytes
+from uw_dslam_ros2.cli.reporting.outcome import json_bytes
+from uw_dslam_ros2.cli.running.mapping import mountings_of, sensor_config
 from uw_dslam_ros2.core.clocks import find_gaps
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination
@@ -304,7 +304,7 @@ def _report(diagnoses: Sequence[Diagnosis], findings: Sequence[Finding]) -> dict
 
 def _page(diagnoses: Sequence[Diagnosis], findings: Sequence[Finding], settings: str) -> bytes:
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("uw_dslam_ros2.cli"),
+        loader=jinja2.PackageLoader("uw_dslam_ros2.cli.reporting"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from uw_dslam_ros2.cli.common import parser_for, run_command
-from uw_dslam_ros2.cli.outcome import Trajectory, json_bytes
-from uw_dslam_ros2.cli.report import whose_error
-from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M, Scores, Truth, read_truth, score
+from uw_dslam_ros2.cli.reporting.outcome import Trajectory, json_bytes
+from uw_dslam_ros2.cli.reporting.report import whose_error
+from uw_dslam_ros2.cli.reporting.scoring import WALL_TOLERANCE_M, Scores, Truth, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.io.maps.files import read_map

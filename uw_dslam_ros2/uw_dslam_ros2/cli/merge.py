@@ -21,9 +21,15 @@ from uw_dslam_ros2.cli.common import (
     versions,
     warn,
 )
-from uw_dslam_ros2.cli.map_merging import MapFile, MergedMaps, Placement, VerdictRow, merge_maps
-from uw_dslam_ros2.cli.mapping import OfflineConfig
-from uw_dslam_ros2.cli.outcome import json_bytes
+from uw_dslam_ros2.cli.reporting.outcome import json_bytes
+from uw_dslam_ros2.cli.running.map_merging import (
+    MapFile,
+    MergedMaps,
+    Placement,
+    VerdictRow,
+    merge_maps,
+)
+from uw_dslam_ros2.cli.running.mapping import OfflineConfig
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps.files import read_map, write_map
@@ -136,7 +142,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 def write_merged(folder: Path, result: MergedMaps, config: OfflineConfig) -> None:
     """Write all files; what an earlier run left of a merged map goes, where there is none now."""
     # Drawing takes longer to import than reading maps does.
-    from uw_dslam_ros2.cli.pictures import before_after, png_bytes
+    from uw_dslam_ros2.cli.reporting.pictures import before_after, png_bytes
 
     prefix = folder / _MAP
     if result.merged is not None and result.provenance is not None:

@@ -11,13 +11,13 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from uw_dslam_ros2.cli.charting import charted
 from uw_dslam_ros2.cli.common import parser_for, progress_bar, run_command, versions
-from uw_dslam_ros2.cli.heap import give_back, keep_apart
-from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recordings, sensor_config, settle
-from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
-from uw_dslam_ros2.cli.report import RunFacts, headline, write_report
-from uw_dslam_ros2.cli.scoring import Truth, read_truth
+from uw_dslam_ros2.cli.reporting.outcome import Outcome, outcome_of
+from uw_dslam_ros2.cli.reporting.report import RunFacts, headline, write_report
+from uw_dslam_ros2.cli.reporting.scoring import Truth, read_truth
+from uw_dslam_ros2.cli.running.charting import charted
+from uw_dslam_ros2.cli.running.heap import give_back, keep_apart
+from uw_dslam_ros2.cli.running.mapping import OfflineConfig, map_recordings, sensor_config, settle
 from uw_dslam_ros2.core.errors import ConfigError, DataError, NothingMappedError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.merging import Decision, Georeference, MapQueue

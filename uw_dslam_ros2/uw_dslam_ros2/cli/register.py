@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from uw_dslam_ros2.cli.common import parser_for, run_command, warn
-from uw_dslam_ros2.cli.outcome import json_bytes
+from uw_dslam_ros2.cli.reporting.outcome import json_bytes
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.registration import (
     GridRegistrationConfig,
@@ -99,7 +99,7 @@ def _run(args: argparse.Namespace) -> int:
         _merge(args, source, target, result)
     if args.out is not None:
         # Drawing takes longer to import than many a search takes.
-        from uw_dslam_ros2.cli.pictures import overlay, png_bytes
+        from uw_dslam_ros2.cli.reporting.pictures import overlay, png_bytes
 
         motion = result.T_target_source
         if motion is None:
@@ -123,9 +123,9 @@ def _merge(
     result: RegistrationResult,
 ) -> None:
     """Write what ``merge`` writes, with the answer that was told."""
-    from uw_dslam_ros2.cli.map_merging import MapFile, merge_maps, told
-    from uw_dslam_ros2.cli.mapping import OfflineConfig
     from uw_dslam_ros2.cli.merge import names_of, write_merged
+    from uw_dslam_ros2.cli.running.map_merging import MapFile, merge_maps, told
+    from uw_dslam_ros2.cli.running.mapping import OfflineConfig
 
     paths = [args.target, args.source]
     occupancies = [target, source]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from uw_dslam_ros2.cli.common import parser_for, run_command
-from uw_dslam_ros2.cli.rewriting import has_report, write_anew
+from uw_dslam_ros2.cli.reporting.rewriting import has_report, write_anew
 from uw_dslam_ros2.io.sessions.session import load_session, session_of
 from uw_dslam_ros2.view.queue_source import QueueSource
 from uw_dslam_ros2.view.server import ViewServer

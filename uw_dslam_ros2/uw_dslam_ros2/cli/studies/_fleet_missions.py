@@ -8,8 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import uw_dslam_ros2
-from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recording
-from uw_dslam_ros2.cli.scoring import Truth, read_truth
+from uw_dslam_ros2.cli.reporting.scoring import Truth, read_truth
+from uw_dslam_ros2.cli.running.mapping import OfflineConfig, map_recording
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.maps.files import write_map

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from uw_dslam_ros2.cli.charting import chart_tracks, charted
 from uw_dslam_ros2.cli.common import num_processors
-from uw_dslam_ros2.cli.mapping import OfflineConfig, map_recordings, settle
-from uw_dslam_ros2.cli.outcome import outcome_of
-from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M
+from uw_dslam_ros2.cli.reporting.outcome import outcome_of
+from uw_dslam_ros2.cli.reporting.scoring import WALL_TOLERANCE_M
+from uw_dslam_ros2.cli.running.charting import chart_tracks, charted
+from uw_dslam_ros2.cli.running.mapping import OfflineConfig, map_recordings, settle
 from uw_dslam_ros2.cli.studies._common import print_table, progress, write_csv
 from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart
 from uw_dslam_ros2.core.errors import DataError

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.cli.outcome import Trajectory
-from uw_dslam_ros2.cli.scoring import WALL_TOLERANCE_M
+from uw_dslam_ros2.cli.reporting.outcome import Trajectory
+from uw_dslam_ros2.cli.reporting.scoring import WALL_TOLERANCE_M
 from uw_dslam_ros2.cli.studies._common import (
     ARACATI,
     COLOURS,

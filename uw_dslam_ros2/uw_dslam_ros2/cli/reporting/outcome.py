@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.cli.decision_rows import DecisionRow
-from uw_dslam_ros2.cli.looks import looks_of
+from uw_dslam_ros2.cli.reporting.decision_rows import DecisionRow
+from uw_dslam_ros2.cli.reporting.looks import looks_of
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.merging import (
     Constraint,

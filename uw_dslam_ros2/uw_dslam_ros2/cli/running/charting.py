@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.cli.outcome import Outcome, VehicleOutcome
+from uw_dslam_ros2.cli.reporting.outcome import Outcome, VehicleOutcome
 from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart, refined
 from uw_dslam_ros2.core.chart.pings import DrawnPing
 from uw_dslam_ros2.core.chart.redraw import drift_of, moved_by

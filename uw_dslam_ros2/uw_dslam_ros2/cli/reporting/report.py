@@ -12,12 +12,12 @@ from typing import Any
 import jinja2
 from matplotlib.figure import Figure
 
-from uw_dslam_ros2.cli import pictures
-from uw_dslam_ros2.cli.heap import give_back
-from uw_dslam_ros2.cli.link_report import known_over_time
-from uw_dslam_ros2.cli.outcome import Outcome, json_bytes, write_outcome
-from uw_dslam_ros2.cli.scoring import Scores, Truth, score
-from uw_dslam_ros2.cli.wall_lines import walls_of, walls_picture
+from uw_dslam_ros2.cli.reporting import pictures
+from uw_dslam_ros2.cli.reporting.link_report import known_over_time
+from uw_dslam_ros2.cli.reporting.outcome import Outcome, json_bytes, write_outcome
+from uw_dslam_ros2.cli.reporting.scoring import Scores, Truth, score
+from uw_dslam_ros2.cli.reporting.wall_lines import walls_of, walls_picture
+from uw_dslam_ros2.cli.running.heap import give_back
 from uw_dslam_ros2.core.merging import Georeference
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
@@ -213,7 +213,7 @@ def render_html(
 ) -> str:
     """Fill the template; pictures become data URIs, so that the file stands alone."""
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("uw_dslam_ros2.cli"),
+        loader=jinja2.PackageLoader("uw_dslam_ros2.cli.reporting"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from uw_dslam_ros2.cli.processes import Child, Children, free_domain
+from uw_dslam_ros2.cli.running.processes import Child, Children, free_domain
 from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig
 from uw_dslam_ros2.core.merging import SubmapState
 from uw_dslam_ros2.io.sessions.session import SESSION_FOLDER

@@ -9,14 +9,14 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from uw_dslam_ros2.cli.map_drawing import (
+from uw_dslam_ros2.cli.reporting.map_drawing import (
     legend_below,
     scale_bar,
     set_title,
     show_map,
     single_map,
 )
-from uw_dslam_ros2.cli.outcome import Outcome
+from uw_dslam_ros2.cli.reporting.outcome import Outcome
 from uw_dslam_ros2.core.chart.lines import Pier, Wall, trace_walls
 from uw_dslam_ros2.core.grid import UNKNOWN, OccupancyMap
 from uw_dslam_ros2.core.merging import SubmapState, last_seen_ns

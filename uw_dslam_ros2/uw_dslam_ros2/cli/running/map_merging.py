@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uw_dslam_ros2.cli.mapping import Counter, OfflineConfig, settle
-from uw_dslam_ros2.cli.outcome import Outcome, outcome_of
+from uw_dslam_ros2.cli.reporting.outcome import Outcome, outcome_of
+from uw_dslam_ros2.cli.running.mapping import Counter, OfflineConfig, settle
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.merging import MapProvenance, MapQueue, MapQueueConfig, SubmapRecord

@@ -18,7 +18,7 @@ from matplotlib.transforms import Affine2D
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.cli.outcome import Trajectory
+from uw_dslam_ros2.cli.reporting.outcome import Trajectory
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.metrics import ends_of_rows
 from uw_dslam_ros2.core.se2 import SE2

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from uw_dslam_ros2.cli.outcome import Trajectory
+from uw_dslam_ros2.cli.reporting.outcome import Trajectory
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.metrics import (

@@ -9,9 +9,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from uw_dslam_ros2.cli.demo_link import LinkedMission
-from uw_dslam_ros2.cli.map_drawing import INK, VEHICLE_COLORS, blank_figure
-from uw_dslam_ros2.cli.scoring import Truth
+from uw_dslam_ros2.cli.reporting.map_drawing import INK, VEHICLE_COLORS, blank_figure
+from uw_dslam_ros2.cli.reporting.scoring import Truth
+from uw_dslam_ros2.cli.running.demo_link import LinkedMission
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
 from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.io.sessions.session import load_session

@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from PIL import Image
 
-from uw_dslam_ros2.cli.map_drawing import (
+from uw_dslam_ros2.cli.reporting.map_drawing import (
     AGREE_COLOR,
     EXTRA_COLOR,
     FOOT,
@@ -46,8 +46,8 @@ from uw_dslam_ros2.cli.map_drawing import (
     single_map,
     to_bytes,
 )
-from uw_dslam_ros2.cli.outcome import Outcome
-from uw_dslam_ros2.cli.scoring import Scores, Truth
+from uw_dslam_ros2.cli.reporting.outcome import Outcome
+from uw_dslam_ros2.cli.reporting.scoring import Scores, Truth
 from uw_dslam_ros2.core.grid import OccupancyMap, bounds_of, strips_of
 from uw_dslam_ros2.core.merging import ConstraintKind, SubmapState
 from uw_dslam_ros2.core.metrics import interpolate_poses, resample

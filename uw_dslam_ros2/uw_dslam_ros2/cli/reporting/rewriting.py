@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from uw_dslam_ros2.cli.outcome import outcome_of
+from uw_dslam_ros2.cli.reporting.outcome import outcome_of
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import MapQueue
 
@@ -44,7 +44,7 @@ def write_anew(folder: Path, queue: MapQueue) -> None:
         Naming the file that cannot be read or written.
     """
     # Drawing takes long to import, and most who look decide nothing.
-    from uw_dslam_ros2.cli.report import RunFacts, write_report
+    from uw_dslam_ros2.cli.reporting.report import RunFacts, write_report
 
     told = _told(folder / _REPORT)
     names = {field.name for field in dataclasses.fields(RunFacts)}
