@@ -70,8 +70,7 @@ def test_instruments_that_are_wrong_all_the_time_are_found(seed):
         Track(
             p * [1.01, 1.01, 1.0],
             [echoes_of_room(q, rng) for q in p + np.array([0.0, 0.0, turned_rad])],
-            drift_m=0.01,
-            drift_rad=0.001,
+            drift=np.full((len(p), 2), (0.01, 0.001)),
         )
         for p in true
     ]
@@ -105,3 +104,35 @@ def test_ranges_that_are_too_long_are_found(scale, expected):
     true = [there_and_back(7.0), there_and_back(13.0)]
     tracks = [Track(p, [scale * echoes_of_room(q, rng) for q in p]) for p in true]
     assert range_scales(tracks, 0.05, 0.8) == pytest.approx([expected] * 2, abs=0.006)
+
+
+def test_a_log_that_says_too_little_is_not_taken_for_ranges_that_are_too_long():
+    rng = np.random.default_rng(4)
+    true = there_and_back(7.0)
+    shrunk = Track(true * [0.987, 0.987, 1.0], [echoes_of_room(q, rng) for q in true])
+    assert range_scales([shrunk], 0.05, 0.8) == [1.0]
+
+
+def test_several_vehicles_together_say_that_ranges_are_too_long():
+    """One alone might have a bad log."""
+    rng = np.random.default_rng(4)
+    true = [there_and_back(7.0), there_and_back(13.0), there_and_back(10.0)]
+    tracks = [Track(p, [1.015 * echoes_of_room(q, rng) for q in p]) for p in true]
+    assert range_scales(tracks[:1], 0.05, 0.8) == [1.0]
+    assert range_scales(tracks, 0.05, 0.8) == pytest.approx([1.0 / 1.015] * 3, abs=0.004)
+
+
+def test_a_path_bends_where_navigation_was_silent():
+    """A jump on 2 m of the way back, twelve standard deviations of what it drifts elsewhere."""
+    rng = np.random.default_rng(6)
+    true = there_and_back(10.0)
+    jumped = true + np.where(np.arange(len(true)) > 42, 1.0, 0.0)[:, None] * [0.25, 0.2, 0.0]
+    drift = np.full((len(true), 2), (0.015, 0.001))
+    silent = drift.copy()
+    silent[40:45] = 0.3, 0.001
+    errors = []
+    for known in (drift, silent):
+        track = Track(jumped, [echoes_of_room(q, rng) for q in true], drift=known)
+        (found,) = refine_tracks([track], 0.05, 0.8)
+        errors.append(error_m([found.poses], [true]))
+    assert errors[1] < 0.6 * errors[0]

@@ -18,7 +18,7 @@ from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.merging import SubmapRecord, SubmapState
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.se2 import wrap_angle
-from uw_dslam_ros2.core.submap import SubmapId, Track
+from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["PingTracks", "chart_tracks", "charted"]
 
@@ -87,6 +87,11 @@ def _tracks_of(records: Sequence[SubmapRecord], pings: Pings) -> PingTracks:
     """Pings of each run's merged submaps, where the settled graph places them."""
     kept: dict[Track, list[DrawnPing]] = {}
     poses: dict[Track, list[FloatArray]] = {}
+    drifts: dict[Track, list[tuple[float, float]]] = {}
+    runs: dict[Track, list[Submap]] = {}
+    for record in records:
+        runs.setdefault(record.submap.submap_id.track, []).append(record.submap)
+    drift = {key: own for submaps in runs.values() for key, own in drift_of(submaps).items()}
     for record in records:
         submap_id = record.submap.submap_id
         if record.state is not SubmapState.MERGED:
@@ -95,12 +100,9 @@ def _tracks_of(records: Sequence[SubmapRecord], pings: Pings) -> PingTracks:
             pose = record.T_component_submap @ ping.T_submap_sonar
             kept.setdefault(submap_id.track, []).append(ping)
             poses.setdefault(submap_id.track, []).append(pose.as_array())
+            drifts.setdefault(submap_id.track, []).append(drift[submap_id])
     return {
-        track: PingTrack(
-            kept[track],
-            np.array(poses[track]),
-            **drift_of([r.submap for r in records if r.submap.submap_id.track == track]),
-        )
+        track: PingTrack(kept[track], np.array(poses[track]), np.array(drifts[track]))
         for track in kept
     }
 

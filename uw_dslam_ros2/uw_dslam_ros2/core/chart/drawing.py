@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.chart.pings import DrawnPing
 from uw_dslam_ros2.core.chart.refine import (
-    DRIFT_M,
-    DRIFT_RAD,
     Track,
     range_scales,
     refine_tracks,
@@ -44,16 +42,15 @@ _ROUNDED = 5
 class PingTrack:
     """Pings of one vehicle in order of time, and ``T_map_sonar`` (K, 3) of each.
 
-    Ranges are drawn times ``range_scale``. ``drift_m`` and ``drift_rad`` are what the path gains
-    on one metre (standard deviations); ``mounting_rad`` is the turn of the sonar on its vehicle
-    that is in the poses but not in the recording.
+    Ranges are drawn times ``range_scale``. ``drift`` (K, 2) are standard deviations of what the
+    path [m] and its heading [rad] gain on one metre there; ``mounting_rad`` is the turn of the
+    sonar on its vehicle that is in the poses but not in the recording.
     """
 
     pings: Sequence[DrawnPing]
     T_map_sonar: FloatArray
+    drift: FloatArray | None = None
     range_scale: float = 1.0
-    drift_m: float = DRIFT_M
-    drift_rad: float = DRIFT_RAD
     mounting_rad: float = 0.0
 
     def __post_init__(self) -> None:
@@ -72,15 +69,7 @@ class PingTrack:
 def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]:
     """The same pings where all of them see the same walls; see `refine_tracks`."""
     block_m = _BLOCK_M + _BLOCK_CELLS * resolution_m
-    paths = [
-        Track(
-            t.T_map_sonar,
-            [p.points for p in t.pings],
-            drift_m=t.drift_m,
-            drift_rad=t.drift_rad,
-        )
-        for t in tracks
-    ]
+    paths = [Track(t.T_map_sonar, [p.points for p in t.pings], drift=t.drift) for t in tracks]
     scales = range_scales(paths, resolution_m, block_m)
     scaled = [
         dataclasses.replace(path, range_scale=scale)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.chart.drawing import SHARE_AGAINST, PingTrack, refined
 from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.chart.refine import DRIFT_M, DRIFT_RAD
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
 from uw_dslam_ros2.core.se2 import SE2, compose_poses, wrap_angle
@@ -44,7 +45,12 @@ def redrawn(
     if not kept:
         return []
     poses = [(submap.T_odom_submap @ ping.T_submap_sonar).as_array() for submap, ping in kept]
-    before = PingTrack([ping for _, ping in kept], np.array(poses), **drift_of(submaps))
+    drift = drift_of(submaps)
+    before = PingTrack(
+        [ping for _, ping in kept],
+        np.array(poses),
+        np.array([drift[submap.submap_id] for submap, _ in kept]),
+    )
     (after,) = refined([before], config.resolution_m)
     result, first, T_new_old = [], 0, SE2()
     for submap in submaps:
@@ -99,20 +105,23 @@ def _moved(before: PingTrack, after: PingTrack) -> FloatArray:
     return moved
 
 
-def drift_of(submaps: Sequence[Submap]) -> dict[str, float]:
-    """What navigation says a path gains on one metre, of a run's submaps in their order.
+def drift_of(submaps: Sequence[Submap]) -> dict[SubmapId, tuple[float, float]]:
+    """What navigation says the path through each submap of a run gains on one metre.
 
-    ``drift_m`` and ``drift_rad`` of a `PingTrack`; empty where that is not known.
+    Standard deviations [m], [rad]. Where an instrument fell silent it is more than elsewhere;
+    where nobody says, as much as in most.
     """
-    found = []
+    known: dict[SubmapId, tuple[float, float]] = {}
     for before, after in itertools.pairwise(submaps):
         way_m = float(np.hypot(*np.diff(before.trajectory[:, :2], axis=0).T).sum())
         if after.sequence == before.sequence + 1 and way_m > 0.0:
-            found.append(np.diag(after.covariance) / way_m)
-    if not found:
-        return {}
-    x, y, yaw = np.median(found, axis=0)
-    return {"drift_m": math.sqrt(0.5 * (x + y)), "drift_rad": math.sqrt(yaw)}
+            x, y, yaw = np.diag(after.covariance) / way_m
+            known[before.submap_id] = math.sqrt(0.5 * (x + y)), math.sqrt(yaw)
+    typical = (DRIFT_M, DRIFT_RAD)
+    if known:
+        drift_m, drift_rad = np.median(list(known.values()), axis=0)
+        typical = float(drift_m), float(drift_rad)
+    return {submap.submap_id: known.get(submap.submap_id, typical) for submap in submaps}
 
 
 def _revised(submap: Submap, T_odom_submap: SE2) -> Submap:

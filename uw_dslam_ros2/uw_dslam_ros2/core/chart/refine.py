@@ -32,8 +32,10 @@ DRIFT_M, DRIFT_RAD = 0.03, 0.003
 _WAY_SIGMA, _MOUNTING_SIGMA_RAD = 0.01, 0.01
 """Of the way, by a velocity log's scale; of the sonar's yaw on the vehicle."""
 _ANCHOR_SIGMA_M, _ANCHOR_SIGMA_RAD = 0.5, 0.02
-_STRETCH_SIGMA, _MIN_STRETCH = 0.02, 0.01
-"""Of ranges, by a speed of sound that nobody set; what is less may come of thick echoes."""
+_STRETCH_SIGMA = 0.02
+"""Of ranges, by a speed of sound that nobody set."""
+_SIGMAS = 2.0
+"""Ranges are too long where it takes a path that is this much worse to explain it otherwise."""
 _NOTHING = 1e-6
 """Standard deviation of what is not asked."""
 _INFORMATION_SHARE = 0.1
@@ -50,15 +52,14 @@ _MAX_FLATNESS = 0.15
 class Track:
     """Pings of one vehicle in order: ``T_map_sonar`` (K, 3), and each one's echoes (N, 2) [m].
 
-    Ranges count times ``range_scale``. ``drift_m`` and ``drift_rad`` are the standard deviations
-    of what the path gains on one metre.
+    Ranges count times ``range_scale``. ``drift`` (K, 2) are standard deviations of what the path
+    [m] and its heading [rad] gain on one metre there; `DRIFT_M` and `DRIFT_RAD` where nobody says.
     """
 
     poses: FloatArray
     echoes: Sequence[NDArray[np.floating]]
     range_scale: float = 1.0
-    drift_m: float = DRIFT_M
-    drift_rad: float = DRIFT_RAD
+    drift: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +74,8 @@ class Refined:
 class _Problem:
     """All echoes in arrays; ``node`` (K,) and ``share`` (K,) place pings between nodes.
 
+    ``node_drift`` (M, 2) is that of the way to the next node.
+
     Unknowns are the bends of all nodes (3 M,), then of all tracks (T,) the stretch of ranges, the
     stretch of the way, and the sonar's turn.
     """
@@ -84,6 +87,7 @@ class _Problem:
     share: FloatArray
     node_centers: FloatArray
     node_track: IntArray
+    node_drift: FloatArray
     ping: IntArray
     echo: FloatArray
 
@@ -115,7 +119,7 @@ def refine_tracks(tracks: Sequence[Track], noise_m: float, block_m: float) -> li
     problem = _arranged(tracks, _MAX_ECHOES)
     if len(problem.echo) == 0:
         return [Refined(track.poses, 0.0) for track in tracks]
-    found = _solved(problem, _prior(problem, way_sigma=_WAY_SIGMA), noise_m, block_m)
+    found = _solved(problem, _prior(problem), noise_m, block_m)
     poses, turns = problem.poses + _bends(problem, found), problem.turns(found)
     return [Refined(poses[problem.track == t], float(turns[t])) for t in range(len(tracks))]
 
@@ -123,17 +127,22 @@ def refine_tracks(tracks: Sequence[Track], noise_m: float, block_m: float) -> li
 def range_scales(tracks: Sequence[Track], noise_m: float, block_m: float) -> list[float]:
     """Factor on each track's ranges without which its pings do not agree; mostly 1.
 
-    Ranges that are too long draw a map that is too large, and poses would follow it. A path and
-    ranges that are both too long agree, so that only the path's own measure tells: ranges that
-    are said to be too *short* are left alone, for it is rather that measure which is too long (see
+    Ranges that are too long draw a map that is too large, and poses would follow it. But a path
+    that is too short looks the same, so ranges are shortened only by more than what a velocity
+    log gets wrong; of several tracks in one water that all say so, it takes less. Ranges that
+    are said to be too *short* are left alone, for it is rather the path that is too long (see
     `core.doctor`). Parameters as in `refine_tracks`.
     """
     problem = _arranged(tracks, _FEW_ECHOES)
     if len(problem.echo) == 0:
         return [1.0] * len(tracks)
-    found = _solved(problem, _prior(problem, stretch_sigma=_STRETCH_SIGMA), noise_m, block_m)
-    stretches = problem.stretches(found)
-    return [1.0 + float(s) if s < -_MIN_STRETCH else 1.0 for s in stretches]
+    prior = _prior(problem, stretch_sigma=_STRETCH_SIGMA, way_sigma=_NOTHING)
+    stretches = problem.stretches(_solved(problem, prior, noise_m, block_m))
+    is_long = stretches < -_WAY_SIGMA
+    num_long = max(1, int(is_long.sum()))
+    if stretches[is_long].sum() / num_long > -_SIGMAS * _WAY_SIGMA / math.sqrt(num_long):
+        return [1.0] * len(tracks)
+    return [1.0 + float(s) if s < -_WAY_SIGMA else 1.0 for s in stretches]
 
 
 def _solved(problem: _Problem, prior: sp.csr_matrix, noise_m: float, block_m: float) -> FloatArray:
@@ -147,7 +156,8 @@ def _solved(problem: _Problem, prior: sp.csr_matrix, noise_m: float, block_m: fl
 
 
 def _arranged(tracks: Sequence[Track], max_echoes: int) -> _Problem:
-    nodes, shares, centers, owners, pings, echoes, first = [], [], [], [], [], [], 0
+    nodes, shares, centers, owners, drifts, first = [], [], [], [], [], 0
+    pings, echoes = [], []
     num_pings = 0
     in_all = sum(len(track.poses) for track in tracks)
     max_echoes = max(1, min(max_echoes, _MAX_ECHOES_IN_ALL // max(in_all, 1)))
@@ -162,6 +172,11 @@ def _arranged(tracks: Sequence[Track], max_echoes: int) -> _Problem:
         knots = np.arange(count) * way[-1] / (count - 1)
         centers.append(np.column_stack([np.interp(knots, way, column) for column in xy.T]))
         owners.append(np.full(count, t))
+        middles = knots + 0.5 * knots[1]
+        drift = track.drift
+        if drift is None:
+            drift = np.full((len(way), 2), (DRIFT_M, DRIFT_RAD))
+        drifts.append(np.column_stack([np.interp(middles, way, d) for d in drift.T]))
         first += count
         for points in track.echoes:
             kept = points[:: max(1, -(-len(points) // max_echoes))].astype(np.float64)
@@ -177,6 +192,7 @@ def _arranged(tracks: Sequence[Track], max_echoes: int) -> _Problem:
         np.concatenate(shares),
         np.vstack(centers),
         np.concatenate(owners),
+        np.vstack(drifts),
         np.concatenate(pings),
         np.vstack(echoes),
     )
@@ -192,7 +208,7 @@ def _bends(problem: _Problem, found: FloatArray) -> FloatArray:
 
 
 def _prior(
-    problem: _Problem, *, stretch_sigma: float = _NOTHING, way_sigma: float = _NOTHING
+    problem: _Problem, *, stretch_sigma: float = _NOTHING, way_sigma: float = _WAY_SIGMA
 ) -> sp.csr_matrix:
     """Square root (rows, unknowns) of the information that there is without any echo."""
     num_tracks, num_nodes = len(problem.tracks), problem.num_nodes
@@ -217,8 +233,8 @@ def _prior(
                 (len(first), 3 * num_nodes + 3 * num_tracks),
             )
         )
-    drift = np.array([(t.drift_m, t.drift_m, t.drift_rad) for t in problem.tracks])
-    weight = 1.0 / (math.sqrt(_NODE_M) * np.maximum(drift[track], _NOTHING))
+    drift = problem.node_drift[first][:, [0, 0, 1]]
+    weight = 1.0 / (math.sqrt(_NODE_M) * np.maximum(drift, _NOTHING))
     bends = [sp.diags(weight[:, axis]) @ rows[axis] for axis in range(3)]
     anchor = np.tile([1 / _ANCHOR_SIGMA_M] * 2 + [1 / _ANCHOR_SIGMA_RAD], num_nodes)
     of_tracks = np.repeat([1 / stretch_sigma, 1 / way_sigma, 1 / _MOUNTING_SIGMA_RAD], num_tracks)
