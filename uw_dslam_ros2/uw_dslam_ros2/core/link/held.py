@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.link.coding.codec import Layer, LayeredSubmap, read_outline
 from uw_dslam_ros2.core.link.coding.items import LayerKey
-from uw_dslam_ros2.core.link.coding.outline import Outline
 from uw_dslam_ros2.core.submap import Submap
 
 __all__ = ["HeldSubmaps"]
@@ -38,10 +37,16 @@ class HeldSubmaps:
         """An own submap as the others have it."""
         return self.submaps.get((self._number, key.run, key.sequence))
 
-    def outlines_of_others(self) -> list[Outline]:
-        """Of all vehicles but this one."""
-        others = [held.outline for place, held in self.submaps.items() if place[0] != self._number]
-        return [outline for outline in others if outline is not None]
+    def likeness(self, key: LayerKey) -> float:
+        """How much walls an own submap could have in common with one of another vehicle [m]."""
+        held = self.own(key)
+        if held is None or held.outline is None:
+            return 0.0
+        others = [
+            other.outline for place, other in self.submaps.items() if place[0] != self._number
+        ]
+        likeness = [held.outline.likeness(other) for other in others if other is not None]
+        return max(likeness, default=0.0)
 
     def take_name(self, sender: int, name: str) -> None:
         """Hear a vehicle's name; `InvalidInputError` where name or number is another's already."""

@@ -19,7 +19,6 @@ from uw_dslam_ros2.core.link.coding.codec import (
 from uw_dslam_ros2.core.link.coding.items import (
     ItemKind,
     LayerKey,
-    PeerReport,
     Status,
     hello_item,
     layer_item,
@@ -31,8 +30,9 @@ from uw_dslam_ros2.core.link.coding.items import (
 from uw_dslam_ros2.core.link.held import HeldSubmaps
 from uw_dslam_ros2.core.link.reporting import Reporting, fitted
 from uw_dslam_ros2.core.link.transport.inbox import Inbox
-from uw_dslam_ros2.core.link.transport.outbox import Outbox, OutItem
+from uw_dslam_ros2.core.link.transport.outbox import LOSS_LIMIT, Outbox, OutItem
 from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES, Packet, bundled, unbundled
+from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED, Relays
 from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState, ReceivedState
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
@@ -68,6 +68,7 @@ class AcousticLink:
         self._name, self._epoch = name, epoch % 4
         self.counts = LinkCounts()
         self._outbox = Outbox()
+        self._relays = Relays(config.number, config.packet_bytes)
         self._own: dict[LayerKey, OutItem] = {}
         self._sources: dict[tuple[int, int], Submap] = {}
         self._inboxes: dict[int, Inbox] = {}
@@ -176,13 +177,9 @@ class AcousticLink:
 
     def _rank_cells(self) -> None:
         """Own cells that look most like what others have seen go first: they may join."""
-        others = self._held.outlines_of_others()
         for key, item in self._own.items():
-            held = self._held.own(key)
-            if key.layer is not Layer.COARSE or held is None or held.outline is None:
-                continue
-            likeness = [held.outline.likeness(other) for other in others]
-            item.rank = _CELLS_RANK + 0.4 / (1.0 + 0.1 * max(likeness, default=0.0))
+            if key.layer is Layer.COARSE:
+                item.rank = _CELLS_RANK + 0.4 / (1.0 + 0.1 * self._held.likeness(key))
 
     # --- packets out -------------------------------------------------------------------------
 
@@ -191,12 +188,16 @@ class AcousticLink:
         peers = self._peers(now_s)
         item = self._outbox.next_item(peers)
         notes: list[bytes] = []
-        if self._reporting.is_due(
+        is_due = self._reporting.is_due(
             now_s,
             is_idle=item is None,
             is_complete=self.is_complete,
             is_unheard=self._outbox.is_unheard(peers),
-        ):
+        )
+        is_free = item is None and not (is_due and self._reporting.is_turn)
+        if is_free and (relayed := self._relayed(peers)) is not None:
+            return self._counted("relayed", relayed)
+        if is_due:
             notes = [self._report(now_s, peers)]
         while note := self._outbox.take_whole(self._room - len(bundled(notes)), peers):
             notes.append(note)
@@ -214,11 +215,18 @@ class AcousticLink:
                 label = "status"
             elif len(notes) == 1 and item is not None:
                 label = item.label
+        return self._counted(label, packet)
+
+    def _relayed(self, peers: list[int]) -> bytes | None:
+        """A repair of what somebody else has said, for a turn that would be left empty."""
+        epochs = {sender: inbox.epoch for sender, inbox in self._inboxes.items()}
+        loss = min(self.loss, LOSS_LIMIT)
+        return self._relays.next_packet(self._items, epochs, peers, loss, self._key)
+
+    def _counted(self, label: str, packet: bytes) -> bytes:
         self._reporting.sent(is_report=label == "status")
-        self.counts.repairs = self._outbox.num_repairs
-        counts = self.counts
-        counts.sent_packets[label] = counts.sent_packets.get(label, 0) + 1
-        counts.sent_bytes[label] = counts.sent_bytes.get(label, 0) + len(packet)
+        self.counts.repairs = self._outbox.num_repairs + self._relays.num_sent
+        self.counts.count_sent(label, len(packet))
         return packet
 
     def num_open(self, now_s: float) -> int:
@@ -270,7 +278,8 @@ class AcousticLink:
         """
         try:
             packet = Packet.unpack(data, self._key)
-            if packet.sender == self._config.number:
+            is_relayed = packet.num_needed > 0 and packet.index >= FIRST_RELAYED
+            if packet.sender == self._config.number and not is_relayed:
                 raise InvalidInputError(f"packet of sender {packet.sender}, which is this vehicle")
         except InvalidInputError as error:
             self._refuse(error)
@@ -278,8 +287,13 @@ class AcousticLink:
         self.counts.received_packets += 1
         self.counts.received_bytes += len(data)
         sender = packet.sender
-        self._heard_s[sender] = now_s
         inbox = self._inboxes.get(sender)
+        if is_relayed:
+            is_old = inbox is not None and inbox.epoch != packet.epoch
+            if is_old or sender == self._config.number:
+                return []
+        else:
+            self._heard_s[sender] = now_s
         if inbox is None or inbox.epoch != packet.epoch:
             inbox = self._inboxes[sender] = Inbox(packet.epoch)
             self._items[sender] = {}
@@ -290,6 +304,7 @@ class AcousticLink:
                 for note in unbundled(packet.payload):
                     self._take_note(sender, inbox, note)
             else:
+                self._relays.overhear(sender, inbox.whole_number(packet.number))
                 self._take_found(sender, inbox, inbox.add(packet))
         except InvalidInputError as error:
             self._refuse(error)
@@ -307,12 +322,11 @@ class AcousticLink:
         else:
             inbox.expect(said.num_items, said.voids)
             self._reporting.num_news += not inbox.is_complete  # tell what is lacking
-            report = said.peers.get(self._config.number)
-            if report is None and said.is_cut:
-                return
-            if report is None or report.epoch != self._epoch:
-                report = PeerReport(self._epoch, 0)
-            self._outbox.hear(sender, report)
+            for other, its_inbox in self._inboxes.items():
+                if other != sender and (report := said.of(other, its_inbox.epoch)) is not None:
+                    self._relays.hear(other, sender, report)
+            if (report := said.of(self._config.number, self._epoch)) is not None:
+                self._outbox.hear(sender, report)
 
     def _take_found(self, sender: int, inbox: Inbox, found: tuple[int, bytes] | None) -> None:
         self._reporting.num_news += 1

@@ -8,7 +8,7 @@ from uw_dslam_ros2.core.link.types import LinkConfig
 
 __all__ = ["Reporting", "fitted"]
 
-_PACKETS_PER_STATUS = 12  # between two reports while there is something else to send
+_PACKETS_PER_STATUS = 16  # between two reports while there is something else to send
 _HASTE = 0.15  # who has nothing else to say reports that much sooner
 _MAX_UNANSWERED = 10
 
@@ -57,6 +57,11 @@ class Reporting:
             wait_s *= _HASTE * 2.0**self._num_unanswered
             return since_s >= min(wait_s, self._config.heartbeat_s)
         return since_s >= self._config.heartbeat_s
+
+    @property
+    def is_turn(self) -> bool:
+        """Whether something else has gone out since the last report."""
+        return self._num_packets > 0
 
     def told(self, now_s: float) -> None:
         """Note that a report goes out."""

@@ -34,7 +34,7 @@ class LinkConfig(Config):
         10.0,
         0.1,
         3600.0,
-        "what has come is told at most this often, but for every ten packets [s]",
+        "what has come is told at most this often, but for every sixteen packets [s]",
     )
     heartbeat_s: float = setting(
         60.0, 1.0, 36000.0, "a vehicle that has nothing to say says so this often [s]"
@@ -56,6 +56,11 @@ class LinkCounts:
     repairs: int = 0
     refused: dict[str, int] = field(default_factory=dict)
     """Packets and items that were not taken, by the reason's first words."""
+
+    def count_sent(self, label: str, num_bytes: int) -> None:
+        """Note a packet that leaves, by what it holds."""
+        self.sent_packets[label] = self.sent_packets.get(label, 0) + 1
+        self.sent_bytes[label] = self.sent_bytes.get(label, 0) + num_bytes
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,6 +133,13 @@ class Status:
     is_cut: bool = False
     """Whether there was no room for all peers; else nothing has come of those not named."""
 
+    def of(self, sender: int, epoch: int) -> PeerReport | None:
+        """What has come of a sender since an epoch began; None where that is not said."""
+        report = self.peers.get(sender)
+        if report is None and self.is_cut:
+            return None
+        return report if report is not None and report.epoch == epoch else PeerReport(epoch, 0)
+
     def pack(self) -> bytes:
         """To a note."""
         writer = ByteWriter()

@@ -60,7 +60,7 @@ class Inbox:
         The caller checks the content and calls `finish` if it is sound; else it will be sent
         again. Raises `InvalidInputError` where the fragments do not make an item.
         """
-        number = self._number(packet.number)
+        number = self.whole_number(packet.number)
         if self.has(number):
             self.num_duplicates += 1
             return None
@@ -137,7 +137,7 @@ class Inbox:
         held = self._open.get(number)
         return None if held is None else held.num_needed - len(held.fragments)
 
-    def _number(self, short: int) -> int:
+    def whole_number(self, short: int) -> int:
         """The whole number that a packet means: one that is missing, near the newest known."""
         newest = max(self._num_items - 1, 0)
         near = newest - (newest - short + NUM_NUMBERS // 2) % NUM_NUMBERS + NUM_NUMBERS // 2

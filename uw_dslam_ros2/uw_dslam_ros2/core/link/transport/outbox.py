@@ -7,12 +7,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.link.coding.items import PeerReport, whole_note
-from uw_dslam_ros2.core.link.transport.erasure import MAX_INDEX
 from uw_dslam_ros2.core.link.transport.packets import Packet, bundled, framed, num_parts, part_of
+from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED
 
-__all__ = ["OutItem", "Outbox"]
+__all__ = ["LOSS_LIMIT", "OutItem", "Outbox"]
 
-_LOSS_LIMIT = 0.6  # beyond that, more repair in advance only crowds the others out
+LOSS_LIMIT = 0.6
+"""Beyond that, more repair in advance only crowds the others out."""
 _LOSS_MEMORY = 0.8
 _SPARE, _SPARE_LOSS = 1, 0.1  # repairs more, where turns would be left empty and packets get lost
 _LOSS_DOUBT = 5.0  # packets that are taken to have arrived before any report
@@ -113,13 +114,14 @@ class Outbox:
         """
         known = list(peers)
         for spare in (0, _SPARE):
-            best: tuple[tuple[float, float, int], OutItem] | None = None
+            best: tuple[tuple[float, bool, float, int], OutItem] | None = None
             for item in self.items:
                 left = self._left(item, known, spare)
                 if left <= 0:
                     continue
-                # Of two equally useful items the one that is complete sooner, then the older one.
-                order = (item.rank, left / max(1, item.parts), item.number)
+                # Others may repair what one has; then what is complete sooner, then the older.
+                is_held = any(item.peers.get(peer, (1, 0))[0] == 0 for peer in known)
+                order = (item.rank, is_held, left / max(1, item.parts), item.number)
                 if best is None or order < best[0]:
                     best = order, item
             if best is not None:
@@ -132,7 +134,7 @@ class Outbox:
         item.parts = item.parts or num_parts(len(data), max_bytes)
         self.num_repairs += item.num_sent >= item.parts
         # Nobody gets the same again before all sums have been sent.
-        index = item.num_sent % (MAX_INDEX + 1)
+        index = item.num_sent % FIRST_RELAYED
         payload = part_of(data, item.parts, index)
         item.num_sent += 1
         return Packet(epoch, sender, item.number, item.parts, index, payload).pack(key)
@@ -166,12 +168,12 @@ class Outbox:
             heard = item.peers.get(peer)
             if heard is None or heard[1] == 0:
                 # It has said nothing of it yet: as many as it is likely to need.
-                likely = math.floor(item.parts / (1.0 - min(self.loss, _LOSS_LIMIT)))
+                likely = math.floor(item.parts / (1.0 - min(self.loss, LOSS_LIMIT)))
                 left = max(left, likely - item.num_sent)
                 continue
             lacking, mark = heard
             if lacking:
-                wanted = math.floor(lacking / (1.0 - min(self.loss, _LOSS_LIMIT)) + 0.5)
+                wanted = math.floor(lacking / (1.0 - min(self.loss, LOSS_LIMIT)) + 0.5)
                 if self.loss > _SPARE_LOSS:
                     wanted += spare
                 left = max(left, wanted - (item.num_sent - mark))
