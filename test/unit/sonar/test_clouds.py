@@ -27,12 +27,42 @@ def test_points_all_round_are_a_turn_at_once():
 
 
 @pytest.mark.parametrize("points", [ring(0.0, 1.0), ring()[:3], np.empty((0, 2))])
-def test_few_points_wait_until_time_tells_what_they_are(points):
-    fan, turning = Clouds(), Clouds()
-    assert taken(fan, [0.0, 0.1, 0.2], points) == [[], [0.0, 0.1], [0.2]]
-    assert fan.turn_spacing_rad == 0.0
-    assert taken(turning, [0, 14, 28, 42], points) == [[], [], [0, 14, 28], [42]]
-    assert turning.turn_spacing_rad > 0.0
+def test_clouds_that_come_quickly_are_of_a_fan(points):
+    clouds = Clouds()
+    assert taken(clouds, [0.0, 0.1, 0.2], points) == [[], [0.0, 0.1], [0.2]]
+    assert clouds.turn_spacing_rad == 0.0
+
+
+@pytest.mark.parametrize("period_s", [4.5, 14, 35])
+def test_few_echoes_from_everywhere_are_of_turns(period_s):
+    clouds = Clouds()
+    sides = [ring(0.0, 0.5), ring(1.5, 2.0), ring(3.5, 3.6)]
+    given = [clouds.add(int(i * period_s * S), side, i) for i, side in enumerate(sides)]
+    assert given == [[], [], [0, 1, 2]]
+    assert clouds.turn_spacing_rad > 0.0
+
+
+@pytest.mark.parametrize("period_s", [4.5, 10, 30])
+@pytest.mark.parametrize("aperture_rad", [0.5, math.radians(130.0)])
+@pytest.mark.parametrize("ahead_rad", [0.0, math.pi, -1.2])
+def test_clouds_that_never_leave_an_aperture_are_of_a_slow_fan(period_s, aperture_rad, ahead_rad):
+    """Whichever way it looks, whatever part of it hears something."""
+    rng, clouds = np.random.default_rng(0), Clouds()
+    given = []
+    for i in range(40):
+        bearing = ahead_rad + rng.uniform(-0.5, 0.5, rng.integers(0, 60)) * aperture_rad
+        points = 10.0 * np.column_stack([np.cos(bearing), np.sin(bearing)])
+        given += clouds.add(int(i * period_s * S), points, i)
+    assert given == list(range(40))
+    assert clouds.turn_spacing_rad == 0.0
+
+
+def test_what_was_taken_for_a_slow_fan_is_a_turn_once_it_hears_elsewhere():
+    clouds = Clouds()
+    taken(clouds, np.arange(0, 112, 14), ring(0.0, 1.0))
+    assert clouds.turn_spacing_rad == 0.0
+    assert clouds.add(126 * S, ring(3.0, 3.5), "behind") == ["behind"]
+    assert clouds.turn_spacing_rad > 0.0
 
 
 def test_what_waits_comes_with_the_first_turn_that_shows_itself():
