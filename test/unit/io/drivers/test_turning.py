@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.io.drivers import ReadSettings, adapter_of
 from uw_dslam_ros2.io.interfaces import make_typestore
 from uw_dslam_ros2.io.outgoing import MessageFactory
-from uw_dslam_ros2.io.readings import BeamsEvent, PointsEvent, ScanEvent
+from uw_dslam_ros2.io.readings import BeamsEvent, ImageEvent, PointsEvent, ScanEvent
 
 SETTINGS = ReadSettings(vehicle_id="auv_1")
 SECOND = 1_000_000_000
@@ -195,6 +195,10 @@ def test_the_sea_bed_is_no_beam():
         ("t", "f4", [0.0, 2.0, 1.0]),
         ("time", "u4", [0, 2_000_000_000, 1_000_000_000]),
         ("timestamp", "f8", [1.7e9, 1.7e9 + 2.0, 1.7e9 + 1.0]),
+        ("timestamp", "f8", [1.7e18, 1.7e18 + 2e9, 1.7e18 + 1e9]),
+        ("stamp", "f8", [1.7e15, 1.7e15 + 2e6, 1.7e15 + 1e6]),
+        ("timestamp", "f8", [1.7e9 + 3600.0, 1.7e9 + 3602.0, 1.7e9 + 3601.0]),  # another clock
+        ("t", "f4", [-2.0, 0.0, -1.0]),  # from the end
     ],
 )
 def test_points_with_times_are_beams(name, kind, values):
@@ -206,6 +210,8 @@ def test_points_with_times_are_beams(name, kind, values):
     assert isinstance(event, BeamsEvent)
     offsets = (event.beam_stamp_ns - event.beam_stamp_ns[0]) * 1e-9
     np.testing.assert_allclose(offsets, [0.0, 1.0, 2.0], atol=1e-6)
+    if kind == "f8":
+        assert event.stamp_ns == pytest.approx(1_700_000_000 * SECOND, abs=2 * SECOND)
     np.testing.assert_allclose(event.range_m, [5.0, 5.0, 6.0])
     np.testing.assert_allclose(np.degrees(event.bearing_rad), [36.8699, 0.0, 90.0], atol=1e-3)
     assert (event.range_m < event.range_max_m).all()
@@ -215,6 +221,44 @@ def test_times_of_one_moment_are_left_out():
     rows = [(4, 3, 0, 0.0), (0, 6, 0, 0.01)]
     (event,) = read(CLOUD, cloud([*XYZ, ("t", "f4")], rows))
     assert isinstance(event, PointsEvent)
+
+
+def test_times_without_the_digits_they_need_are_left_out():
+    rows = [(4, 3, 0, 1.7e9), (0, 6, 0, 1.7e9 + 128.0)]
+    msg = cloud([*XYZ, ("timestamp", "f4")], rows)
+    msg.header.stamp.sec = 1_700_000_000
+    assert isinstance(read(CLOUD, msg)[0], PointsEvent)
+
+
+@pytest.mark.parametrize("name", ["intensity", "i", "amplitude"])
+@pytest.mark.parametrize("bearings", [[40.0], list(range(-60, 60, 2))])
+def test_bins_of_beams_are_no_points(name, bearings):
+    rows = [
+        (r * np.cos(b), r * np.sin(b), 0.0, 200.0 if r == 3.0 else 4.0)
+        for b in np.radians(bearings)
+        for r in np.arange(0.5, 6.0, 0.5)
+    ]
+    (event,) = read(CLOUD, cloud([*XYZ, (name, "f4")], rows))
+    assert isinstance(event, BeamsEvent if len(bearings) == 1 else ImageEvent)
+    seen = event if isinstance(event, BeamsEvent) else event.image
+    np.testing.assert_allclose(np.degrees(seen.bearing_rad), bearings, atol=1e-4)
+    np.testing.assert_allclose(seen.range_m[np.argmax(seen.intensity, axis=0)], 3.0, atol=1e-5)
+
+
+def test_echoes_with_an_intensity_are_points():
+    """Also where a wall recedes from beam to beam, so that their ranges rise."""
+    bearing = np.linspace(0.2, 1.2, 30)
+    rows = [(4.0, 4.0 * np.tan(b), 0.0, 50.0) for b in bearing]
+    (event,) = read(CLOUD, cloud([*XYZ, ("intensity", "f4")], rows))
+    assert isinstance(event, PointsEvent)
+    assert len(event.points) == 30
+
+
+def test_an_organised_cloud_keeps_the_beams_that_heard_something():
+    rows = [(4, 3, 0), (np.nan, np.nan, np.nan), (5, 0, 0), (np.inf, 0, 0)]
+    msg = cloud(XYZ, rows)
+    msg.height, msg.width, msg.row_step = 2, 2, 2 * msg.point_step
+    assert read(CLOUD, msg)[0].points.tolist() == [[4.0, 3.0], [5.0, 0.0]]
 
 
 def test_cloud_with_padding():

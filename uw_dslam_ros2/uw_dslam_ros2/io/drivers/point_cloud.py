@@ -9,31 +9,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.sonar import SonarImage
+from uw_dslam_ros2.core.sonar.turning import is_few_beams
 from uw_dslam_ros2.io.drivers.adapter import Adapter, as_bytes, key_of, stamp_of
 from uw_dslam_ros2.io.drivers.laser_scan import ONE_MOMENT_S
 from uw_dslam_ros2.io.drivers.settings import ReadSettings
-from uw_dslam_ros2.io.readings import BeamsEvent, PointsEvent
+from uw_dslam_ros2.io.readings import BeamsEvent, ImageEvent, PointsEvent
 
 __all__ = ["ADAPTERS", "read_cloud", "read_old_cloud"]
 
 FloatArray = NDArray[np.float64]
+_Read = PointsEvent | BeamsEvent | ImageEvent
 
 # By the constants of PointField.
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_STAMP_FIELDS = ("t", "time", "timestamp", "time_stamp", "stamp", "time_offset", "offset_time")
-_INTENSITIES = ("intensity", "intensities")
+_STAMP_FIELDS = (
+    "t",
+    "time",
+    "timestamp",
+    "time_stamp",
+    "stamp",
+    "time_offset",
+    "offset_time",
+    "t_offset",
+)
+_INTENSITIES = ("intensity", "intensities", "i", "amplitude", "power", "strength")
 _MIN_BINS = 8
+_SAME_BEARING_RAD = 1e-3
+_DAY_S = 86400.0
+_LONGEST_TURN_S = 60.0
 
 
-def read_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | BeamsEvent]:
-    """Echoes of one moment, in the plane or in space.
+def read_cloud(msg: Any, settings: ReadSettings) -> Sequence[_Read]:
+    """Echoes of one moment, in the plane or in space; or bins of beams, each with an intensity.
 
-    With a field of times (seconds as reals, nanoseconds as integers; from the stamp, or absolute)
-    that span more than a moment, those near the frame's plane are beams of a sonar that turns.
+    With a field of times (from the stamp, or absolute) that span more than a moment, those near
+    the frame's plane are beams of a sonar that turns.
     """
     cells, fields, order = _cells(msg)
     names = ("x", "y", "z") if "z" in fields else ("x", "y")
     points = np.column_stack([_column(cells, fields, order, name) for name in names])
+    if (channel := next((n for n in _INTENSITIES if n in fields), None)) is not None:
+        values = _column(cells, fields, order, channel)
+        if (event := _of_bins(msg, settings, points, values)) is not None:
+            return (event,)
     is_used = np.isfinite(points).all(axis=1)
     offset_s = _offsets(cells, fields, order, stamp_of(msg))
     if offset_s is not None and is_used.any():
@@ -86,15 +105,33 @@ def _column(cells: NDArray[np.uint8], fields: dict[str, Any], order: str, name: 
 def _offsets(
     cells: NDArray[np.uint8], fields: dict[str, Any], order: str, stamp_ns: int
 ) -> FloatArray | None:
-    """Time of each point after the message's stamp [s]; None without such a field."""
+    """Time of each point after the message's stamp [s]; None without such a field.
+
+    Integers are nanoseconds, reals seconds, or nanoseconds where they span too much for seconds.
+    """
     name = next((n for n in _STAMP_FIELDS if n in fields), None)
     if name is None or len(cells) == 0:
         return None
-    values = _column(cells, fields, order, name)
-    if int(fields[name].datatype) not in (7, 8):
-        values = values * 1e-9
-    # An absolute time is that of an epoch: no sonar turns for a day.
-    return values - stamp_ns * 1e-9 if float(np.nanmax(np.abs(values))) > 86400.0 else values
+    values, kind, stamp_s = (
+        _column(cells, fields, order, name),
+        fields[name].datatype,
+        stamp_ns / 1e9,
+    )
+    known = values[np.isfinite(values)]
+    if int(kind) not in (7, 8):
+        return values * 1e-9
+    if not len(known):
+        return values
+    middle = float(np.median(known))
+    for unit in (1.0, 1e-3, 1e-6, 1e-9):
+        if middle * unit > _DAY_S and abs(middle * unit - stamp_s) < _DAY_S:
+            if kind == 7:
+                return None  # seconds of an epoch in 32 bits are minutes apart
+            offset_s = values * unit - stamp_s
+            # The stamp was put on another clock, or is of another: the first point's then.
+            is_apart = np.abs(known * unit - stamp_s).min() > _LONGEST_TURN_S
+            return offset_s - float(np.nanmin(offset_s)) if is_apart else offset_s
+    return values * 1e-9 if float(np.ptp(known)) > 10.0 * _LONGEST_TURN_S else values
 
 
 def _beams(
@@ -118,7 +155,7 @@ def _beams(
     )
 
 
-def read_old_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | BeamsEvent]:
+def read_old_cloud(msg: Any, settings: ReadSettings) -> Sequence[_Read]:
     """Read a ``PointCloud``: bins of one beam or sector with a channel of intensities, or echoes.
 
     Drivers of Tritech's Micron send one message per beam, whose points are the bins of range.
@@ -134,30 +171,38 @@ def read_old_cloud(msg: Any, settings: ReadSettings) -> Sequence[PointsEvent | B
                 f"channels[{channel.name}] has {len(values)} values, expected one per point "
                 f"({len(xyz)})"
             )
-        beams = _bins(xyz, values)
-        if beams is not None:
-            bearing_rad, range_m, intensity = beams
-            stamps = np.full(len(bearing_rad), stamp_of(msg), np.int64)
-            return (
-                BeamsEvent(
-                    *key_of(msg, settings),
-                    stamps,
-                    bearing_rad,
-                    range_m,
-                    float(range_m[-1] + 0.5 * (range_m[1] - range_m[0])),
-                    intensity,
-                ),
-            )
+        if (event := _of_bins(msg, settings, xyz, values)) is not None:
+            return (event,)
     return (_points(msg, settings, xyz[np.isfinite(xyz).all(axis=1)]),)
 
 
+def _of_bins(
+    msg: Any, settings: ReadSettings, points: FloatArray, values: FloatArray
+) -> BeamsEvent | ImageEvent | None:
+    """Beams of one moment where the points (N, 2 or 3) are bins; a whole fan is an image."""
+    if (found := _bins(points, values)) is None:
+        return None
+    bearing_rad, range_m, intensity = found
+    image = SonarImage(stamp_of(msg), intensity, range_m, bearing_rad)
+    if not is_few_beams(image):
+        return ImageEvent(*key_of(msg, settings), image, "x")
+    return BeamsEvent(
+        *key_of(msg, settings),
+        np.full(len(bearing_rad), stamp_of(msg), np.int64),
+        bearing_rad,
+        range_m,
+        float(range_m[-1] + 0.5 * (range_m[1] - range_m[0])),
+        intensity,
+    )
+
+
 def _bins(
-    xyz: FloatArray, values: FloatArray
+    points: FloatArray, values: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.generic]] | None:
     """Bearings (B,), ranges (R,), intensities (R, B) where the points are bins; else None."""
-    if not (np.isfinite(xyz).all() and np.isfinite(values).all()):
+    if not (len(points) and np.isfinite(points).all() and np.isfinite(values).all()):
         return None
-    ranges = np.hypot(xyz[:, 0], xyz[:, 1])
+    ranges = np.hypot(points[:, 0], points[:, 1])
     starts = np.flatnonzero(np.concatenate([[True], np.diff(ranges) <= 0.0]))
     num_bins = len(ranges) // len(starts)
     if num_bins < _MIN_BINS or (np.diff(np.append(starts, len(ranges))) != num_bins).any():
@@ -165,7 +210,12 @@ def _bins(
     by_beam = ranges.reshape(-1, num_bins)
     if np.ptp(by_beam, axis=0).max() > 0.01 * by_beam[0, -1]:
         return None
-    last = xyz.reshape(-1, num_bins, 3)[:, -1]
+    flat = points[:, :2].reshape(-1, num_bins, 2)
+    last = flat[:, -1]
+    # How far the bins lie beside the line to their beam's last.
+    aside = np.abs(flat[..., 0] * last[:, None, 1] - flat[..., 1] * last[:, None, 0])
+    if (aside > _SAME_BEARING_RAD * by_beam[:, -1:] ** 2).any():
+        return None
     intensity = values.reshape(-1, num_bins).T
     is_count = values.min() >= 0.0 and 1.0 < values.max() <= 255.0
     return (
