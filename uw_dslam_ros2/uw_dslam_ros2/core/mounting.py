@@ -167,6 +167,11 @@ class StaticFrames:
     def __contains__(self, frame_id: str) -> bool:
         return frame_id.strip("/") in self._parent
 
+    @property
+    def names(self) -> Set[str]:
+        """Frames whose parent was told."""
+        return self._parent.keys()
+
     def lookup(self, base_frame_id: str, frame_id: str) -> FloatArray:
         """``T_base_frame`` (4, 4), through any number of links upwards from `frame_id`.
 

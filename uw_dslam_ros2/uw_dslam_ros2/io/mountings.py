@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +22,42 @@ from uw_dslam_ros2.io.readings import (
     TransformEvent,
     VelocityEvent,
 )
+from uw_dslam_ros2.io.topics import NAMES_OF_ROLES, parts_of
 
-__all__ = ["Mountings", "role_of", "usual_mounting"]
+__all__ = ["Mountings", "base_frame_of", "role_of", "usual_mounting"]
 
 FloatArray = NDArray[np.float64]
 
 _NEEDS_NONE = DepthEvent | PoseEvent | FixEvent
 """Readings that mean nearly the same wherever on the vehicle they are taken."""
 _NOTABLE_TILT_RAD = math.radians(10.0)  # shortens ranges by 1.5 %
+_WORLD = {"map", "odom", "world", "earth", "ned", "enu"}
+
+
+def base_frame_of(links: Collection[tuple[str, str]], vehicle_id: str, namespace: str = "") -> str:
+    """Frame of a vehicle's body in a tree of frames: (parent, child), slashes or not.
+
+    That called base_link, of the vehicle's name or namespace or the only one; else the only one
+    that instruments hang from.
+    """
+    parents = {parent.strip("/") for parent, _ in links}
+    children = {child.strip("/") for _, child in links}
+    frames = parents | children
+    tail = parts_of(namespace)[-1] or vehicle_id
+    expected = [f"{tail}/base_link", f"{vehicle_id}/base_link", "base_link"]
+    if found := [name for name in expected if name in frames]:
+        return found[0]
+    others = sorted(name for name in frames if parts_of(name)[-1] == "base_link")
+    if not others:
+        below_world = {c.strip("/") for p, c in links if _is_world(p)}
+        roots = {name for name in parents if not _is_world(name)} - (children - below_world)
+        own = {name for name in roots if parts_of(name)[0] in (tail, vehicle_id)}
+        others = sorted(own or {name for name in roots if "/" not in name})
+    return others[0] if len(others) == 1 else expected[0]
+
+
+def _is_world(frame_id: str) -> bool:
+    return bool(_WORLD & set(re.split("[^a-z]+", parts_of(frame_id)[-1].lower())))
 
 
 class Mountings:
@@ -43,6 +73,9 @@ class Mountings:
     unknown : dict[str, str]
         Frames that no transform leads from to the body -> kind of reading. They are taken to sit
         at its origin, with the axes that their message's definition says.
+    taken_for : dict[str, tuple[str, str]]
+        Such frames of a sonar or a DVL -> kind of reading, and the only frame that transforms
+        have for one by its name: that is taken then.
     tilted : dict[str, float]
         Frames of sonars that point notably up or down -> by how much [rad].
     """
@@ -52,6 +85,7 @@ class Mountings:
         self._frames = StaticFrames()
         self._known: dict[tuple[type, str], FloatArray] = {}
         self.unknown: dict[str, str] = {}
+        self.taken_for: dict[str, tuple[str, str]] = {}
         self.tilted: dict[str, float] = {}
 
     def add(self, event: TransformEvent) -> None:
@@ -59,6 +93,7 @@ class Mountings:
         self._frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
         self._known.clear()
         self.unknown.clear()
+        self.taken_for.clear()
 
     @property
     def num_frames(self) -> int:
@@ -68,7 +103,9 @@ class Mountings:
     def is_known(self, event: Reading) -> bool:
         """Whether `of` would give what transforms tell, or was asked in vain before."""
         frame_id = _frame_of(event)
-        if isinstance(event, _NEEDS_NONE) or self._is_base(frame_id) or frame_id in self.unknown:
+        if isinstance(event, _NEEDS_NONE) or self._is_base(frame_id):
+            return True
+        if frame_id in self.unknown or frame_id in self.taken_for:
             return True
         if (type(event), frame_id) in self._known:
             return True
@@ -92,6 +129,8 @@ class Mountings:
 
     def _mounting(self, event: Reading, frame_id: str) -> FloatArray:
         if not frame_id.strip("/"):
+            if (named := self._named_mounting(event, frame_id)) is not None:
+                return named
             if role_of(event) == "sonar":  # of others the place counts little
                 self.unknown[frame_id] = role_of(event)
             return usual_mounting(event)
@@ -102,9 +141,30 @@ class Mountings:
         try:
             return self._frames.lookup(self._base_frame_id, frame_id)
         except InvalidInputError:
+            if (named := self._named_mounting(event, frame_id)) is not None:
+                return named
             if not isinstance(event, _NEEDS_NONE):
                 self.unknown[frame_id] = role_of(event)
             return usual_mounting(event)
+
+    def _named_mounting(self, event: Reading, frame_id: str) -> FloatArray | None:
+        """The mounting of the only sonar, or DVL, that transforms name; None if there is none."""
+        word = role_of(event)
+        if _is_world(frame_id):
+            return None
+        words = set(NAMES_OF_ROLES.get({"sonar": "sonar", "dvl": "velocity"}.get(word, ""), ()))
+        found = []
+        for name in sorted(self._frames.names):
+            if words & set(re.split("[^a-z0-9]+", parts_of(name)[-1].lower())):
+                try:
+                    found.append((name, self._frames.lookup(self._base_frame_id, name)))
+                except InvalidInputError:
+                    continue  # another vehicle's
+        if len(found) != 1:
+            return None
+        name, mounting = found[0]
+        self.taken_for[frame_id] = word, name
+        return mounting
 
     def _is_base(self, frame_id: str) -> bool:
         return frame_id.strip("/") in ("", self._base_frame_id.strip("/"))
@@ -115,15 +175,20 @@ class Mountings:
             Finding(
                 "no_mounting",
                 "velocity" if word == "dvl" else word,
-                (
-                    f"no transform says where its frame {frame_id!r} sits"
-                    if frame_id
-                    else "its messages name no frame (header.frame_id)"
-                )
-                + "; it is taken to sit at the origin, level and looking ahead",
+                f"{_nowhere(frame_id)}; it is taken to sit at the origin, level and looking ahead",
                 vehicle_id=vehicle_id,
             )
             for frame_id, word in sorted(self.unknown.items())
+        ]
+        taken = [
+            Finding(
+                "no_mounting",
+                "velocity" if word == "dvl" else word,
+                f"{_nowhere(frame_id)}; it is taken for {name!r}, the only one named so",
+                severity="warning" if frame_id else "info",
+                vehicle_id=vehicle_id,
+            )
+            for frame_id, (word, name) in sorted(self.taken_for.items())
         ]
         tilted = [
             Finding(
@@ -137,7 +202,18 @@ class Mountings:
             )
             for frame_id, tilt_rad in sorted(self.tilted.items())
         ]
-        return unknown + tilted
+        return unknown + taken + tilted
+
+
+def _nowhere(frame_id: str) -> str:
+    if not frame_id:
+        return "its messages name no frame (header.frame_id)"
+    if _is_world(frame_id):
+        return (
+            f"its frame {frame_id!r} is not the vehicle's, which moves in it: have its driver "
+            "publish what it hears in the sonar's own frame"
+        )
+    return f"no transform says where its frame {frame_id!r} sits"
 
 
 def _frame_of(event: Reading) -> str:

@@ -6,7 +6,7 @@ can be; names only decide between several topics that can be the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.errors import DataError
@@ -16,10 +16,10 @@ from uw_dslam_ros2.io.sensor_settings import SENSOR_ROLES as _SENSORS
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
 
 __all__ = [
+    "NAMES_OF_ROLES",
     "ROLES",
     "TopicsConfig",
     "VehicleTopics",
-    "base_frame_of",
     "find_vehicles",
     "roles_of_type",
 ]
@@ -51,7 +51,7 @@ _NEEDS_A_NAME = {
     "std_msgs/msg/Float64", "geometry_msgs/msg/Twist", "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PointStamped",
 }  # fmt: skip
-_NAMES = {
+NAMES_OF_ROLES = {
     "sonar": (
         "sonar", "oculus", "gemini", "ping360", "blueview", "aris", "didson", "fls", "mbes",
         "micron", "miniking", "ping", "scan", "points",
@@ -100,19 +100,6 @@ def roles_of_type(msgtype: str) -> tuple[str, ...]:
     if msgtype == "tf2_msgs/msg/TFMessage":
         return ("tf_static",)
     return ADAPTERS[msgtype].roles if msgtype in ADAPTERS else ()
-
-
-def base_frame_of(frames: Collection[str], vehicle_id: str, namespace: str = "") -> str:
-    """Frame of a vehicle's body among those that tf has (without slashes at their ends).
-
-    That of the vehicle's name or namespace; else the only one that ends in base_link.
-    """
-    tail = parts_of(namespace)[-1] or vehicle_id
-    expected = [f"{tail}/base_link", f"{vehicle_id}/base_link", "base_link"]
-    if found := [name for name in expected if name in frames]:
-        return found[0]
-    others = sorted(name for name in frames if parts_of(name)[-1] == "base_link")
-    return others[0] if len(others) == 1 else expected[0]
 
 
 def parts_of(topic: str) -> list[str]:
@@ -251,7 +238,7 @@ def _candidates(table: Mapping[str, str], role: str, namespace: str) -> list[_Ra
         roles = roles_of_type(msgtype)
         if is_truth or role not in roles or _is_no_measurement(own):
             continue
-        words = _NAMES[role]
+        words = NAMES_OF_ROLES[role]
         if own == [words[0]] or (len(own) == 1 and own[0] in words):
             name = 0
         else:
@@ -275,7 +262,7 @@ def _first_of_parts(tables: Sequence[Mapping[str, str]], names: Sequence[str]) -
 
 def _is_named(parts: Sequence[str], roles: Sequence[str]) -> bool:
     """Whether a topic's name says one of these roles."""
-    words = [word for role in roles for word in _NAMES.get(role, ())]
+    words = [word for role in roles for word in NAMES_OF_ROLES.get(role, ())]
     return any(word in part for part in parts for word in words)
 
 
@@ -344,7 +331,7 @@ def _has_all(roles: set[str], others: set[str]) -> bool:
 
 def _before_a_sensor(prefix: tuple[str, ...]) -> tuple[str, ...]:
     """A lone ``/auv_1/imu/data`` is in namespace auv_1, not auv_1/imu or auv_1/sensors."""
-    words = {word for group in _NAMES.values() for word in group} | _GROUPS
+    words = {word for group in NAMES_OF_ROLES.values() for word in group} | _GROUPS
     while prefix and prefix[-1].lower() in words:
         prefix = prefix[:-1]
     return prefix

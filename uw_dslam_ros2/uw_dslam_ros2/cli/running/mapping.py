@@ -30,11 +30,10 @@ from uw_dslam_ros2.io.conventions import correct_mounting
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.examining import examine_recording, mended
 from uw_dslam_ros2.io.feeding import feed_runs, in_stamp_order
-from uw_dslam_ros2.io.mountings import Mountings, role_of
+from uw_dslam_ros2.io.mountings import Mountings, base_frame_of, role_of
 from uw_dslam_ros2.io.readings import FixEvent
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
-from uw_dslam_ros2.io.topics import base_frame_of
 from uw_dslam_ros2.io.vehicles import VehicleRecording
 
 __all__ = [
@@ -255,9 +254,9 @@ def mountings_of(
 ) -> Mountings:
     """Where a vehicle's instruments sit."""
     known = list(transforms)
-    names = {name.strip("/") for t in known for name in (t.frame_id, t.child_frame_id)}
+    links = {(t.frame_id, t.child_frame_id) for t in known}
     mountings = Mountings(
-        sensors.base_frame or base_frame_of(names, recording.vehicle_id, recording.namespace)
+        sensors.base_frame or base_frame_of(links, recording.vehicle_id, recording.namespace)
     )
     for transform in known:
         mountings.add(transform)

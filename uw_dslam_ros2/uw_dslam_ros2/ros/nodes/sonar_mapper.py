@@ -289,7 +289,11 @@ class SonarMapper(ManagedNode):
 
     def _tell_mountings(self) -> None:
         """Say so where a frame's place is not known, or a sonar looks up or down."""
-        findings = self._mountings.findings(self._vehicle_id)
+        findings = [
+            finding
+            for finding in self._mountings.findings(self._vehicle_id)
+            if finding.severity != "info"
+        ]
         self._mounting_problem = findings[0].sentence if findings else ""
         for finding in findings:
             if finding.sentence not in self._told:
