@@ -1,5 +1,6 @@
 """The mapper as a node: topics, frames, bad messages, a bag that loops."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -16,7 +17,9 @@ from sensor_msgs.msg import Imu, LaserScan
 from tf2_msgs.msg import TFMessage
 from uw_dslam_msgs.srv import GetSubmap
 
+from uw_dslam_ros2.core.chart import redraw
 from uw_dslam_ros2.core.errors import ConfigError
+from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.messages import stamp_of
 from uw_dslam_ros2.ros.convert.core_types import occupancy_from_msg, stamp_to_msg, submap_from_msg
 from uw_dslam_ros2.ros.mapper import sensor_silence
@@ -165,6 +168,44 @@ def test_odometry_does_not_jump_where_the_map_is_corrected(ros_context, spinning
     assert 0.0 < covariance[0, 0] < 1.0
     assert covariance[5, 5] > 0.0
     assert vehicle.odometry[-1].pose.covariance[14] == 1e6  # no depth was measured
+
+
+def test_where_the_last_pass_moves_the_map_the_frame_goes_along(
+    ros_context, spinning, monkeypatch
+):
+    T_after_before = SE2(0.3, -0.2, 0.1)
+
+    def moved(submaps, _pings, _config):
+        return [
+            dataclasses.replace(
+                submap,
+                T_odom_submap=T_after_before @ submap.T_odom_submap,
+                revision=submap.revision + 1,
+            )
+            for submap in submaps
+        ]
+
+    monkeypatch.setattr(redraw, "redrawn", moved)
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    key = ("auv_1/map", "auv_1/odom")
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        vehicle.send_mount()
+        drive(until, vehicle, range(4))
+        assert finish(until, vehicle).success
+        last_ns = START_NS + 3_900_000_000
+        # Later than the last odometry, so that who buffers transforms takes it.
+        until(lambda: stamp_of(vehicle.frames[key]) == last_ns + 1, "the frame")
+        until(lambda: stamp_of(vehicle.odometry[-1]) == last_ns, "the last odometry")
+    frame = vehicle.frames[key].transform
+    yaw = 2.0 * math.atan2(frame.rotation.z, frame.rotation.w)
+    # One drive, one submap and no loop: before the last pass, map and odom are the same.
+    found = SE2(frame.translation.x, frame.translation.y, yaw)
+    assert found.as_array() == pytest.approx(T_after_before.as_array(), abs=1e-6)
+    assert stamp_of(vehicle.frames["auv_1/odom", "auv_1/base_link"]) == last_ns + 1
+    end = vehicle.paths[-1].poses[-1].pose.position  # of the last ping, 0.4 s before
+    base = found @ SE2(vehicle.odometry[-1].pose.pose.position.x, 0.0, 0.0)
+    assert math.hypot(end.x - base.x, end.y - base.y) < 0.6 * SPEED_M_S
 
 
 def test_frames_can_be_named_and_transforms_left_to_others(ros_context, spinning):

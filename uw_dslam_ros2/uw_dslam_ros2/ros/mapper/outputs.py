@@ -55,7 +55,8 @@ class MapperOutputs:
         self._odom_pub = node.create_publisher(Odometry, "odom", DEFAULT)
         self._broadcaster = FrameBroadcaster(node) if config.publishes_tf else None
         self._sent: set[SubmapId] = set()
-        self._T_odom_base = self._T_odom_run = SE2()
+        self._T_odom_base = self._T_odom_run = self._T_map_odom = SE2()
+        self._depth_z_m = 0.0
         self._smooth_mapper: VehicleMapper | None = None
         self.counts: Counter[str] = Counter()
         """Messages sent, for the diagnostics."""
@@ -76,7 +77,6 @@ class MapperOutputs:
 
     def publish_odometry(self, mapper: VehicleMapper, stamp_ns: int) -> None:
         """Send where the vehicle is, without a jump also where a new run begins."""
-        stamp = stamp_to_msg(stamp_ns)
         if self._smooth_mapper is not mapper:
             # A new run begins at its own zero; odometry goes on from where it was.
             self._T_odom_run = self._T_odom_base @ mapper.T_smooth_base.inverse()
@@ -89,20 +89,36 @@ class MapperOutputs:
             mapper.velocity_covariance,
             mapper.depth_m,
         )
-        msg.header.stamp = stamp
+        msg.header.stamp = stamp_to_msg(stamp_ns)
         msg.header.frame_id, msg.child_frame_id = self._odom_frame, self._base_frame
         self._odom_pub.publish(msg)
-        if self._broadcaster is not None:
-            # Loop closures, and where a new run lies, move the frame and not the odometry.
-            T_map_odom = mapper.T_odom_base @ self._T_odom_base.inverse()
-            T_odom_base = transform_to_msg(
-                stamp, self._odom_frame, self._base_frame, self._T_odom_base
-            )
-            T_odom_base.transform.translation.z = msg.pose.pose.position.z
-            self._broadcaster.send(
-                transform_to_msg(stamp, self._map_frame, self._odom_frame, T_map_odom),
-                T_odom_base,
-            )
+        self._depth_z_m = msg.pose.pose.position.z
+        # Loop closures, and where a new run lies, move the frame and not the odometry.
+        self._T_map_odom = mapper.T_odom_base @ self._T_odom_base.inverse()
+        self._send_frames(stamp_ns)
+
+    def correct_frames(
+        self, before: NDArray[np.float64], after: NDArray[np.float64], stamp_ns: int
+    ) -> None:
+        """Send frames once more: the run's path in its map (K, 3) has moved since the last."""
+        if not len(before):
+            return
+        T_after_before = SE2.from_array(after[-1]) @ SE2.from_array(before[-1]).inverse()
+        self._T_map_odom = T_after_before @ self._T_map_odom
+        self._send_frames(stamp_ns)
+
+    def _send_frames(self, stamp_ns: int) -> None:
+        if self._broadcaster is None:
+            return
+        stamp = stamp_to_msg(stamp_ns)
+        T_odom_base = transform_to_msg(
+            stamp, self._odom_frame, self._base_frame, self._T_odom_base
+        )
+        T_odom_base.transform.translation.z = self._depth_z_m
+        self._broadcaster.send(
+            transform_to_msg(stamp, self._map_frame, self._odom_frame, self._T_map_odom),
+            T_odom_base,
+        )
 
     def publish_map(self, mapper: VehicleMapper, stamp_ns: int) -> None:
         """Send the run's map and path, if it has any."""

@@ -364,12 +364,17 @@ class SonarMapper(ManagedNode):
         """Close the last submap, and draw all of them anew; nothing is mapped after that."""
         if self._is_finished:
             return "finished before; nothing changes"
+        self._flush()
+        before = self._mapper.trajectory()[1]
         self._close_last()
         drawn_anew = self._last_pass.draw(self._runs.mappers())
         self._outputs.publish_submaps(drawn_anew, is_drawn_anew=True)
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is not None:
             self._publish_map(stamp_ns)
+            # Who buffers transforms keeps the first of each stamp.
+            after = self._mapper.trajectory()[1]
+            self._outputs.correct_frames(before, after, stamp_ns + 1)
         self._mapper_values = self._runs.diagnostics()
         return (
             f"{self._mapper_values['num_pings']} pings mapped into "
