@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uw_dslam_ros2.core.grid import UNSEEN, GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mosaic import Mosaic, Window, fuse_maps
+from uw_dslam_ros2.core.mosaic import Mosaic, fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import Window
 
 pytestmark = pytest.mark.kernels
 
@@ -69,9 +70,9 @@ def test_unknown_stays_unknown_and_contradictions_are_counted():
     # Two against one: once the half percent from certainty that a map's 100 stands for.
     np.testing.assert_array_equal(mosaic.occupancy(8.0).values, [[99]])
     np.testing.assert_array_equal(mosaic.occupancy(1.0).values, [[73]])
-    np.testing.assert_array_equal(mosaic.contradictions(), [[1]])
+    np.testing.assert_array_equal(mosaic.contradictions().dense(), [[1]])
     owners, sets = mosaic.contributor_sets()
-    assert [sets[k] for k in owners.ravel()] == [{"a", "b", "c"}]
+    assert [sets[k] for k in owners.dense().ravel()] == [{"a", "b", "c"}]
 
 
 def random_map(rng):
@@ -82,10 +83,12 @@ def random_map(rng):
 
 def content(mosaic):
     """Everything that a mosaic says, as bytes."""
-    fused, (owners, sets) = mosaic.occupancy(8.0), mosaic.contributor_sets()
+    fused = mosaic.occupancy(8.0)
     if fused is None:
         return None
-    arrays = fused.values.tobytes(), mosaic.contradictions().tobytes(), owners.tobytes()
+    owners, sets = mosaic.contributor_sets()
+    cells = mosaic.contradictions().dense(), owners.dense()
+    arrays = fused.values.tobytes(), *(values.tobytes() for values in cells)
     return fused.spec, arrays, sets
 
 
@@ -153,6 +156,7 @@ def test_a_map_of_nothing_leaves_nothing():
     mosaic.put("a", 0, nothing, SE2())
     assert mosaic.occupancy(8.0) is None
     assert mosaic.contradictions() is None
+    assert mosaic.contributor_sets() is None
     assert mosaic.window() is None
 
 

@@ -12,7 +12,7 @@ import yaml
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.maps.files import image_of, read_map, write_map
+from uw_dslam_ros2.io.maps.files import read_map, write_map
 
 # Three rows (lowest y first), four columns; asymmetric under every flip and turn.
 VALUES = np.array([[0, 100, -1, -1], [100, 100, 0, 0], [-1, 0, 0, 100]], dtype=np.int8)
@@ -118,8 +118,10 @@ def test_negate_swaps_black_and_white_but_not_in_raw_mode(tmp_path):
     np.testing.assert_array_equal(read_map(path).values, [[7, 100, -1]])
 
 
-def test_the_picture_has_its_first_row_on_top():
-    np.testing.assert_array_equal(image_of(hand_made()), PIXELS_TOP_DOWN)
+def test_the_picture_has_its_first_row_on_top(tmp_path):
+    write_map(tmp_path / "map", hand_made())
+    pixels = cv2.imread(str(tmp_path / "map.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(pixels, PIXELS_TOP_DOWN)
 
 
 @pytest.mark.parametrize(

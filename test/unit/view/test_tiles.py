@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mosaic import SQUARE, Window
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import SQUARE, Window
 from uw_dslam_ros2.view.tiles import TILE_PIXELS, Layer, colours_of_percent, tile_png
 
 

@@ -7,8 +7,9 @@ and taking it away again leaves the same bytes, and so does any order of arrival
 from __future__ import annotations
 
 import functools
+import itertools
 import math
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -22,14 +23,12 @@ from uw_dslam_ros2.core.grid import (
     GridSpec,
     OccupancyMap,
     percent_table,
-    strips_of,
 )
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import SQUARE, SparseCells, Window
 
-__all__ = ["SQUARE", "Drawable", "Mosaic", "Window", "fuse_maps"]
+__all__ = ["Drawable", "Mosaic", "fuse_maps"]
 
-SQUARE = 256
-"""Cells are kept in squares of so many rows and columns."""
 _UNSEEN = int(UNSEEN)
 
 
@@ -42,46 +41,6 @@ class Drawable(Protocol):
 
     def units(self) -> NDArray[np.int16]:
         """Log-odds (R, C) in units of `UNITS_PER_NAT`; `UNSEEN` where nothing was observed."""
-
-
-@dataclass(frozen=True, slots=True)
-class Window:
-    """A rectangle of lattice cells: rows ``row_0 <= row < row_1``, columns likewise."""
-
-    row_0: int
-    col_0: int
-    row_1: int
-    col_1: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.row_1 - self.row_0, self.col_1 - self.col_0
-
-    def union(self, other: Window) -> Window:
-        """Smallest rectangle around both."""
-        return Window(
-            min(self.row_0, other.row_0),
-            min(self.col_0, other.col_0),
-            max(self.row_1, other.row_1),
-            max(self.col_1, other.col_1),
-        )
-
-    def intersection(self, other: Window) -> Window:
-        """What is in both; its shape is not positive if nothing is."""
-        return Window(
-            max(self.row_0, other.row_0),
-            max(self.col_0, other.col_0),
-            min(self.row_1, other.row_1),
-            min(self.col_1, other.col_1),
-        )
-
-    def slices(self, inside: Window) -> tuple[slice, slice]:
-        """Index of this rectangle in an array that covers `inside`."""
-        return (
-            slice(self.row_0 - inside.row_0, self.row_1 - inside.row_0),
-            slice(self.col_0 - inside.col_0, self.col_1 - inside.col_0),
-        )
 
 
 class _Layers:
@@ -196,77 +155,89 @@ class Mosaic:
         _to_percent(tile.total, tile.num_occupied, tile.num_free, table, 0, 0, values)
         return values
 
-    def contradictions(self) -> NDArray[np.uint16] | None:
-        """For each cell of `occupancy`, how many grids vote against its majority."""
+    def contradictions(self) -> SparseCells | None:
+        """For each cell of `occupancy`, how many grids vote against its majority; uint16."""
         window = self.window()
         if window is None:
             return None
-        found = np.zeros(window.shape, np.uint16)
-        for tile in self._tiles.values():
-            common = tile.window.intersection(window)
-            inside = common.slices(tile.window)
-            votes = tile.num_free[inside], tile.num_occupied[inside]
-            found[common.slices(window)] = np.minimum(*votes)
-        return found
+        found = {
+            place: np.minimum(tile.num_free, tile.num_occupied)
+            for place, tile in self._tiles.items()
+        }
+        squares = {place: square for place, square in found.items() if square.any()}
+        return SparseCells(window, squares, np.dtype(np.uint16))
 
-    def contributor_sets(self) -> tuple[NDArray[np.uint32], list[frozenset[Hashable]]]:
-        """For each cell of `occupancy`, which grids saw it: an index into a list of sets.
+    def contributor_sets(self) -> tuple[SparseCells, list[frozenset[Hashable]]] | None:
+        """For each cell of `occupancy`, which grids saw it: an index into a list of sets, uint32.
 
-        The sets are numbered in the order of the grids' keys, so equal mosaics give equal arrays;
-        number 0 is the empty set.
+        Equal mosaics number them alike, whatever came first; number 0 is the empty set.
         """
         window = self.window()
-        sets: list[frozenset[Hashable]] = [frozenset()]
         if window is None:
-            return np.zeros((0, 0), dtype=np.uint32), sets
-        owners = np.zeros(window.shape, dtype=np.uint32)
+            return None
+        owners = {place: np.zeros((SQUARE, SQUARE), np.uint32) for place in sorted(self._tiles)}
+        sets: list[frozenset[Hashable]] = [frozenset()]
         for key in sorted(self._placed, key=repr):
-            held = self._placed[key]
+            held, after = self._placed[key], dict[int, int]()
             if held.window is None:
                 continue
-            alone = _Layers(held.window)
-            _Drawing(self._lattice, held.grid, held.T_frame_map).add_to(alone, 1)
-            part = owners[held.window.slices(window)]
-            before, after = part[alone.observed], {}
-            for number in np.flatnonzero(np.bincount(before)).tolist():
-                after[number] = len(sets)
-                sets.append(sets[number] | {key})
-            table = np.zeros(max(after, default=0) + 1, dtype=np.uint32)
-            table[list(after)] = list(after.values())
-            part[alone.observed] = table[before]
-        # Sets that a later grid has covered wholly are used by no cell any more.
-        is_used = np.zeros(len(sets), np.bool_)
-        is_used[0] = True
-        strips = [owners[strip.rows] for strip in strips_of(len(owners))]
-        for strip in strips:  # counting takes eight bytes a cell
-            is_used |= np.bincount(strip.ravel(), minlength=len(sets)) > 0
-        packed = (np.cumsum(is_used) - 1).astype(np.uint32)
-        for strip in strips:
-            strip[:] = packed[strip]
-        used = np.flatnonzero(is_used).tolist()
-        return owners, [sets[number] for number in used]
+            drawing = _Drawing(self._lattice, held.grid, held.T_frame_map)
+            for place in _squares_of(held.window):
+                alone = _Layers(_window_of(place))
+                if drawing.add_to(alone, 1) is None:
+                    continue
+                square, seen = owners[place], alone.observed
+                numbers, index = np.unique(square[seen], return_inverse=True)
+                for number in numbers.tolist():
+                    if number not in after:
+                        after[number] = len(sets)
+                        sets.append(sets[number] | {key})
+                square[seen] = np.array([after[n] for n in numbers.tolist()], np.uint32)[index]
+        return SparseCells(window, owners, np.dtype(np.uint32)), _packed(owners, sets)
 
     def _draw(self, grid: Drawable, T_frame_map: SE2, sign: int) -> Window | None:
         """Add a grid to the tiles, or subtract it; returns the rectangle that it has seen."""
         drawing = _Drawing(self._lattice, grid, T_frame_map)
-        reach, seen = drawing.window, []
-        for row in range(reach.row_0 // SQUARE, (reach.row_1 - 1) // SQUARE + 1):
-            for col in range(reach.col_0 // SQUARE, (reach.col_1 - 1) // SQUARE + 1):
-                corner = row * SQUARE, col * SQUARE
-                tile = self._tiles.get((row, col)) or _Layers(
-                    Window(*corner, corner[0] + SQUARE, corner[1] + SQUARE)
-                )
-                window = drawing.add_to(tile, sign)
-                if window is not None:
-                    seen.append(window)
-                    self._tiles[row, col] = tile
-                    if tile.num_votes == 0:
-                        del self._tiles[row, col]
+        seen = []
+        for place in _squares_of(drawing.window):
+            tile = self._tiles.get(place) or _Layers(_window_of(place))
+            window = drawing.add_to(tile, sign)
+            if window is not None:
+                seen.append(window)
+                self._tiles[place] = tile
+                if tile.num_votes == 0:
+                    del self._tiles[place]
         if not seen:
             return None
         total = functools.reduce(Window.union, seen)
         self._changed = total if self._changed is None else self._changed.union(total)
         return total
+
+
+def _squares_of(window: Window) -> list[tuple[int, int]]:
+    """Row and column of the squares that a rectangle lies in."""
+    rows = range(window.row_0 // SQUARE, (window.row_1 - 1) // SQUARE + 1)
+    cols = range(window.col_0 // SQUARE, (window.col_1 - 1) // SQUARE + 1)
+    return list(itertools.product(rows, cols))
+
+
+def _window_of(place: tuple[int, int]) -> Window:
+    row, col = place[0] * SQUARE, place[1] * SQUARE
+    return Window(row, col, row + SQUARE, col + SQUARE)
+
+
+def _packed(
+    owners: Mapping[tuple[int, int], NDArray[np.uint32]], sets: list[frozenset[Hashable]]
+) -> list[frozenset[Hashable]]:
+    """Number anew, in place, without the sets that a later grid has covered wholly."""
+    is_used = np.zeros(len(sets), np.bool_)
+    is_used[0] = True
+    for square in owners.values():
+        is_used[square] = True
+    packed = (np.cumsum(is_used) - 1).astype(np.uint32)
+    for square in owners.values():
+        square[:] = packed[square]
+    return [sets[number] for number in np.flatnonzero(is_used).tolist()]
 
 
 class _Drawing:

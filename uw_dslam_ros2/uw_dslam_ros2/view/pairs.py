@@ -17,8 +17,8 @@ from uw_dslam_ros2.core.grid import UNKNOWN, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
 from uw_dslam_ros2.core.merging.graph.answers import Query
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, SubmapGroup, render_group
-from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import Window
 from uw_dslam_ros2.core.submap import SubmapId
 
 __all__ = ["KEY", "PAIR_LAYERS", "Pair", "lay_on", "map_picture", "pair_of", "rendered"]

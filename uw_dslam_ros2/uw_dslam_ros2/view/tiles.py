@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.mosaic import SQUARE, Window
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import SQUARE, Window
 
 __all__ = ["TILE_PIXELS", "Layer", "colours_of_percent", "png_bytes", "rectangle_of", "tile_png"]
 

@@ -20,8 +20,8 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNKNOWN, GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.mapping.drawing.occupancy import SIGHT_CELLS, GrowingGrid
-from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import Window
 
 __all__ = ["SHARE_AGAINST", "PingTrack", "draw_chart", "refined"]
 

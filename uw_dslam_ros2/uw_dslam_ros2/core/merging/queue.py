@@ -31,10 +31,10 @@ from uw_dslam_ros2.core.merging.types import (
     MatchRequest,
     SubmapRecord,
 )
-from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.run_names import RunNames
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import Window
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 
 __all__ = ["MapQueue"]

@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.graph.answers import QueryKey
 from uw_dslam_ros2.core.registration.result import PriorWindow
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import SparseCells
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
 __all__ = [
@@ -108,21 +109,21 @@ class MapProvenance:
     Parameters
     ----------
     spec
-        Place of the arrays in frame "map"; that of the global map.
+        Place of the cells in frame "map"; that of the global map.
     contradictions
-        (R, C) uint16: how many submaps say the opposite of the cell's majority (free, occupied).
+        uint16: how many submaps say the opposite of the cell's majority (free, occupied).
     owners
-        (R, C) uint32: index of the cell's set of submaps in `contributors`; 0, the empty set,
+        uint32: index of the cell's set of submaps in `contributors`; 0, the empty set,
         where nothing was seen.
     contributors
         Sets of submaps, each sorted.
     """
 
     spec: GridSpec
-    contradictions: NDArray[np.uint16]
-    owners: NDArray[np.uint32]
+    contradictions: SparseCells
+    owners: SparseCells
     contributors: tuple[tuple[SubmapId, ...], ...]
 
     def of_cell(self, row: int, col: int) -> tuple[SubmapId, ...]:
         """Submaps that saw a cell."""
-        return self.contributors[int(self.owners[row, col])]
+        return self.contributors[self.owners.at(row, col)]

@@ -17,9 +17,10 @@ from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, OccupancyMap, strips_of
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.maps.image import read_image
+from uw_dslam_ros2.io.maps.png import png_parts
 from uw_dslam_ros2.io.maps.yaml import MapHeader
 
-__all__ = ["image_of", "read_map", "write_map"]
+__all__ = ["read_map", "write_map"]
 
 MapMode = Literal["trinary", "raw"]
 
@@ -41,11 +42,6 @@ _PIXELS = {
     "raw": np.where(_PERCENT < 0, _RAW_UNKNOWN, _PERCENT).astype(np.uint8),
 }
 """Pixel of each value, by mode."""
-
-
-def image_of(occupancy: OccupancyMap) -> NDArray[np.uint8]:
-    """Picture (R, C), first row on top: white is free, black occupied, 205 unknown."""
-    return np.concatenate([*_looked_up(occupancy, _SHADES)])
 
 
 def write_map(
@@ -92,7 +88,7 @@ def write_map(
     )
     contents: dict[Path, bytes | Iterable[bytes]] = {
         pgm_path: _pgm_parts(occupancy, _PIXELS[mode]),
-        png_path: _png_parts(occupancy),
+        png_path: png_parts(occupancy.spec.shape, _looked_up(occupancy, _SHADES)),
         yaml_path: text.encode(),
     }
     return write_files(contents)
@@ -192,7 +188,7 @@ def _num_free_unknown(header: MapHeader, total: NDArray[np.uint32], white: int) 
 
 
 def _looked_up(occupancy: OccupancyMap, table: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
-    """Rows of a picture from the top, in parts: a large map would be there several times."""
+    """Rows of a picture from the top, in parts; in `_SHADES` white is free, black occupied."""
     for strip in reversed(strips_of(occupancy.spec.num_rows)):
         yield np.flipud(table[occupancy.values[strip.rows]])
 
@@ -202,13 +198,3 @@ def _pgm_parts(occupancy: OccupancyMap, table: NDArray[np.uint8]) -> Iterator[by
     yield f"P5\n{num_cols} {num_rows}\n255\n".encode()
     for rows in _looked_up(occupancy, table):
         yield rows.tobytes()
-
-
-def _png_parts(occupancy: OccupancyMap) -> Iterator[bytes]:
-    import cv2  # large, and not every program has pictures
-
-    num_rows, num_cols = occupancy.spec.shape
-    is_done, buffer = cv2.imencode(".png", image_of(occupancy))
-    if not is_done:
-        raise DataError(f"cannot encode a {num_cols} x {num_rows} picture as PNG")
-    yield buffer.tobytes()

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,14 +15,16 @@ from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec
 from uw_dslam_ros2.core.merging import MapProvenance
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import SparseCells
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.atomic import write_files
+from uw_dslam_ros2.io.maps.png import png_parts
 
 __all__ = ["contradictions_png", "read_provenance", "write_provenance"]
 
-_NOT_SEEN, _AGREED = (217, 213, 209), (255, 255, 255)  # blue, green, red
+_NOT_SEEN, _AGREED = (209, 213, 217), (255, 255, 255)  # red, green, blue
 # Agreement is white; one submap against the others is yellow, four and more are dark red.
-_DISPUTED = ((0, 210, 255), (0, 140, 240), (20, 60, 220), (30, 0, 130))
+_DISPUTED = ((255, 210, 0), (240, 140, 0), (220, 60, 20), (130, 0, 30))
 
 
 def write_provenance(path_prefix: str | Path, provenance: MapProvenance) -> list[Path]:
@@ -42,19 +47,35 @@ def write_provenance(path_prefix: str | Path, provenance: MapProvenance) -> list
         "origin": provenance.spec.T_frame_grid.as_array().tolist(),
         "contributors": [[_text(i) for i in ids] for ids in provenance.contributors],
     }
-    archive = io.BytesIO()
-    np.savez_compressed(
-        archive,
-        header=np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
-        contradictions=provenance.contradictions,
-        owners=provenance.owners,
-    )
     return write_files(
         {
-            prefix.with_name(f"{prefix.name}_contradictions.png"): contradictions_png(provenance),
-            prefix.with_name(f"{prefix.name}_provenance.npz"): archive.getvalue(),
+            prefix.with_name(f"{prefix.name}_contradictions.png"): _picture_parts(provenance),
+            prefix.with_name(f"{prefix.name}_provenance.npz"): _archive(header, provenance),
         }
     )
+
+
+def _archive(header: dict[str, Any], provenance: MapProvenance) -> bytes:
+    """As `numpy.savez_compressed` writes it, of arrays that never are there whole."""
+    content = io.BytesIO()
+    text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, shape, dtype, parts in (
+            ("header", text.shape, text.dtype, iter([text])),
+            *(
+                (name, cells.shape, cells.dtype, cells.strips())
+                for name, cells in (
+                    ("contradictions", provenance.contradictions),
+                    ("owners", provenance.owners),
+                )
+            ),
+        ):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                kind = {"descr": dtype.str, "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(entry, kind)
+                for part in parts:
+                    entry.write(part.tobytes())
+    return content.getvalue()
 
 
 def read_provenance(path: str | Path) -> MapProvenance:
@@ -76,7 +97,8 @@ def read_provenance(path: str | Path) -> MapProvenance:
         spec = GridSpec(header["resolution_m"], rows, cols, SE2(*header["origin"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is not a map's provenance: {error}") from error
-    return MapProvenance(spec, contradictions, owners, contributors)
+    cells = SparseCells.of(contradictions), SparseCells.of(owners)
+    return MapProvenance(spec, *cells, contributors)
 
 
 def _text(submap_id: SubmapId) -> str:
@@ -95,12 +117,16 @@ def _submap_id(text: str) -> SubmapId:
 
 def contradictions_png(provenance: MapProvenance) -> bytes:
     """Picture of where submaps disagree, as `write_provenance` describes it."""
-    import cv2  # large, and not every program has pictures
+    return b"".join(_picture_parts(provenance))
 
+
+def _picture_parts(provenance: MapProvenance) -> Iterator[bytes]:
     colors = np.array([_AGREED, *_DISPUTED, _NOT_SEEN], dtype=np.uint8)
-    # Which colour first: three bytes a cell are needed once, and upside down.
-    which = np.minimum(provenance.contradictions, len(_DISPUTED)).astype(np.uint8)
-    which[provenance.owners == 0] = len(colors) - 1
-    is_done, content = cv2.imencode(".png", colors[np.flipud(which)])
-    assert is_done
-    return content.tobytes()
+    disputed, owners = (
+        cells.strips(is_downward=True) for cells in (provenance.contradictions, provenance.owners)
+    )
+    strips = (
+        np.where(owner == 0, len(colors) - 1, np.minimum(number, len(_DISPUTED))).astype(np.uint8)
+        for number, owner in zip(disputed, owners, strict=True)
+    )
+    return png_parts(provenance.spec.shape, strips, colors)

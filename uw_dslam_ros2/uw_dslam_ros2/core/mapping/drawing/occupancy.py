@@ -20,9 +20,9 @@ from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.mapping.drawing.face_kernels import draw_faces
 from uw_dslam_ros2.core.mapping.drawing.grid_kernels import NUM_DIRECTIONS, add_ping, beam_table
 from uw_dslam_ros2.core.mapping.drawing.log_odds_grid import LogOddsGrid, percent_of
-from uw_dslam_ros2.core.mosaic import Window
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import Detections
+from uw_dslam_ros2.core.sparse_cells import Window
 
 __all__ = ["SIGHT_CELLS", "GrowingGrid"]
 

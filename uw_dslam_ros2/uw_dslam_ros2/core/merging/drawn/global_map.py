@@ -13,8 +13,9 @@ from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.config import MAX_MAP_CELLS
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap, joint_box, lattice_box
 from uw_dslam_ros2.core.merging.types import MapProvenance
-from uw_dslam_ros2.core.mosaic import Mosaic, Window
+from uw_dslam_ros2.core.mosaic import Mosaic
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.sparse_cells import Window
 from uw_dslam_ros2.core.submap import SubmapId
 
 FloatArray = NDArray[np.float64]
@@ -60,13 +61,13 @@ class GlobalMap:
 
     def provenance(self) -> MapProvenance | None:
         """Who saw what; None without evidence."""
-        window = self._mosaic.window()
-        contradictions = self._mosaic.contradictions()
-        if window is None or contradictions is None:
+        contradictions, found = self._mosaic.contradictions(), self._mosaic.contributor_sets()
+        if contradictions is None or found is None:
             return None
-        owners, sets = self._mosaic.contributor_sets()
+        owners, sets = found
         named = tuple(tuple(sorted(SubmapId(*i) for i in keys)) for keys in sets)  # type: ignore[misc]
-        return MapProvenance(self._mosaic.spec_of(window), contradictions, owners, named)
+        spec = self._mosaic.spec_of(owners.window)
+        return MapProvenance(spec, contradictions, owners, named)
 
 
 class Piece(NamedTuple):
