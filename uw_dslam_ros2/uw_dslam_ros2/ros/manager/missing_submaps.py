@@ -23,6 +23,8 @@ _SERVICE = "get_submap"
 _PATIENCE_S = 2.0  # what is on its way has come by then
 _LOST_S = 10.0
 _TIMEOUT_S = 10.0
+# A sender that has never answered may not have discovered its asker: then its answers get lost.
+_FIRST_TIMEOUT_S = 1.0
 _MAX_TRIES = 3
 
 
@@ -62,6 +64,7 @@ class MissingSubmaps:
         self._in_words = in_words
         self._group = ReentrantCallbackGroup()
         self._clients: dict[str, Client] = {}
+        self._patience_s: dict[Client, float] = {}
         self._topics: dict[Track, str] = {}
         self._since_s: dict[Track, float] = {}
         self._tries: Counter[SubmapId] = Counter()
@@ -83,6 +86,8 @@ class MissingSubmaps:
             if now_s > asked.deadline_s:
                 asked.client.remove_pending_request(asked.future)
                 del self._asked[track]
+                longer_s = 2.0 * self._patience_s[asked.client]
+                self._patience_s[asked.client] = min(longer_s, _TIMEOUT_S)
         lost = []
         for track, sequences in missing.items():
             waited_s = now_s - self._since_s[track]
@@ -111,12 +116,13 @@ class MissingSubmaps:
                 break
         else:
             return False
-        self._tries[submap_id] += 1
+        patience_s = self._patience_s.setdefault(client, _FIRST_TIMEOUT_S)
+        self._tries[submap_id] += patience_s >= _TIMEOUT_S
         request = GetSubmap.Request(
             vehicle_id=track.vehicle_id, run_id=track.run_id, sequence=sequence
         )
         future = client.call_async(request)
-        self._asked[track] = _Asked(submap_id, client, future, time.monotonic() + _TIMEOUT_S)
+        self._asked[track] = _Asked(submap_id, client, future, time.monotonic() + patience_s)
         future.add_done_callback(lambda done: self._post(lambda: self._answered(track, done)))
         return True
 
@@ -125,6 +131,7 @@ class MissingSubmaps:
         if asked is None or asked.future is not future or future.cancelled():
             return  # given up before
         del self._asked[track]
+        self._patience_s[asked.client] = _TIMEOUT_S
         response = future.result()
         if response is not None and response.result == GetSubmap.Response.DONE:
             self._on_submap(self._topics[track], response.submap)
