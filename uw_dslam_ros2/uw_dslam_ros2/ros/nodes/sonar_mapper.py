@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import secrets
 import time
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +12,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
-from uw_dslam_ros2.core.findings import SEVERITIES, Finding, Severity
+from uw_dslam_ros2.core.findings import Severity
 from uw_dslam_ros2.core.mapping import RunBreak, VehicleMapper, VehicleMapperConfig, VehicleRuns
 from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
 from uw_dslam_ros2.io.conventions import correct, correct_mounting
@@ -28,8 +27,9 @@ from uw_dslam_ros2.ros.mapper.sensor_silence import SensorSilence
 from uw_dslam_ros2.ros.mapper.sensor_topics import SensorTopics
 from uw_dslam_ros2.ros.mapper.services import MapperServices
 from uw_dslam_ros2.ros.mapper.stamp_order import StampOrder
+from uw_dslam_ros2.ros.mapper.troubles import MapperTroubles
 from uw_dslam_ros2.ros.plumbing.diagnostics import Report
-from uw_dslam_ros2.ros.plumbing.frames import WARNING_PERIOD_S, Transforms
+from uw_dslam_ros2.ros.plumbing.frames import Transforms
 from uw_dslam_ros2.ros.plumbing.managed_node import ManagedNode
 from uw_dslam_ros2.ros.plumbing.node_settings import SonarMapperConfig
 from uw_dslam_ros2.ros.plumbing.running import run_node
@@ -79,28 +79,27 @@ class SonarMapper(ManagedNode):
             int(_JUMP_BACK_S * 1e9),
             int(self._mapper_config.max_gap_s * 1e9),
         )
-        self._counts: Counter[str] = Counter()
+        self._troubles = MapperTroubles(self, self._vehicle_id)
         self._mapper_values: dict[str, float | int | str] = {}
-        self._last_problem = self._problem_of_topics = ""
         self._odom_stamp_ns = 0
         self._map_stamp_ns = 0
         self._drawing = Throttle(self._config.map_period_s)
         self._is_finished = self._is_paused = False
-        self._num_breaks_told = 0
         self._silence = SensorSilence(time.monotonic())
         self._topics: SensorTopics | None = None
-        self._worker = Worker("mapper", self._on_worker_error)
+        self._worker = Worker("mapper", self._troubles.complain_of)
         self.at_end(lambda: self._worker.close(_CLOSE_S))
         self._watch = ConventionWatch(
-            self._mapper_config.sonar, self._vehicle_id, self._on_convention, self._on_worker_error
+            self._mapper_config.sonar,
+            self._vehicle_id,
+            self._troubles.note_convention,
+            self._troubles.complain_of,
         )
         self.at_end(self._watch.close)
         self._outputs = MapperOutputs(self, self._config, self._vehicle_id, self._base_frame)
         self.at_end(self._say_last)
         self._group = MutuallyExclusiveCallbackGroup()
         self._mountings = Mountings(self._base_frame)
-        self._mounting_problem = ""
-        self._told: set[str] = set()
         self._transforms = Transforms(
             self,
             self._vehicle_id,
@@ -118,7 +117,7 @@ class SonarMapper(ManagedNode):
             self._config,
             self._vehicle_id,
             self._on_message,
-            self._on_finding,
+            self._troubles.note_finding,
             MapperOutputs.TOPICS,
             self._group,
         )
@@ -169,16 +168,8 @@ class SonarMapper(ManagedNode):
             self._topics.discover()
         except DataError as error:
             # A topic that is set may still come.
-            is_waiting = "no topic" in str(error)
-            self._problem_of_topics = self._problem_of_topics if is_waiting else str(error)
-
-    def _on_finding(self, finding: Finding) -> None:
-        if finding.severity != "info":
-            self._problem_of_topics = finding.sentence
-            self.get_logger().warning(finding.sentence, throttle_duration_sec=WARNING_PERIOD_S)
-
-    def _on_convention(self, finding: Finding) -> None:
-        self.get_logger().warning(finding.sentence)
+            if "no topic" not in str(error):
+                self._troubles.note_topics(str(error))
 
     # --- messages to events ------------------------------------------------------------------
 
@@ -186,37 +177,29 @@ class SonarMapper(ManagedNode):
         if not self.is_active:
             return
         name = sensor.name
-        self._counts[f"num_{name}"] += 1
+        self._troubles.counts[f"num_{name}"] += 1
         self._silence.hear(name, time.monotonic())
         now_ns = self.get_clock().now().nanoseconds
         try:
             check_stamp(msg, now_ns)
             said = sensor.to_events(msg, now_ns)
         except InvalidInputError as error:
-            self._complain(f"bad message on {name}: {error}")
+            self._troubles.complain(f"bad message on {name}: {error}")
             return
         except (ValueError, TypeError, OverflowError) as error:
-            self._complain(f"bad message on {name}: {type(error).__name__}: {error}")
+            self._troubles.complain(f"bad message on {name}: {type(error).__name__}: {error}")
             return
         stamp_ns = stamp_of(msg) or now_ns
         usual = [correct(event, self._config.conventions) for event in said]
         events = [event for event in usual if event is not None]
         if sensor.role == "sonar" and self._is_paused:
-            self._counts["num_pings_paused"] += len(events)
+            self._troubles.counts["num_pings_paused"] += len(events)
             events = []
         if not events:
-            self._counts["num_no_velocity"] += sensor.role == "velocity"
+            self._troubles.counts["num_no_velocity"] += sensor.role == "velocity"
             self._worker.post(functools.partial(self._take, name, stamp_ns, None))
         for event in events:
             self._worker.post(functools.partial(self._take, name, event.stamp_ns, event))
-
-    def _complain(self, text: str) -> None:
-        self._counts["num_bad"] += 1
-        self._last_problem = text
-        self.get_logger().error(text, throttle_duration_sec=WARNING_PERIOD_S)
-
-    def _on_worker_error(self, error: Exception) -> None:
-        self._complain(f"{type(error).__name__}: {error}")
 
     # --- in the worker's thread --------------------------------------------------------------
 
@@ -227,10 +210,10 @@ class SonarMapper(ManagedNode):
         if self._order.offer(stream, stamp_ns, event):
             self._begin_anew(stream, stamp_ns)
         if self._is_finished:
-            self._complain(f"mapping was finished; messages on {stream} are left out")
+            self._troubles.complain(f"mapping was finished; messages on {stream} are left out")
             return
         if self._order.displaced.get(stream, 0) > _MANY_DISPLACED:
-            self._complain(
+            self._troubles.complain(
                 f"the stamps of {stream} have jumped, and those of other sensors have not: its "
                 "messages are left out; are the clocks of both computers set?"
             )
@@ -259,7 +242,7 @@ class SonarMapper(ManagedNode):
         self._outputs.publish_submaps(self._runs.begin(reason))
         self._odom_stamp_ns = self._map_stamp_ns = 0
         self._is_finished = False
-        self._counts["num_restarts"] += 1
+        self._troubles.counts["num_restarts"] += 1
 
     def _on_idle_timer(self) -> None:
         """When nothing comes any more, what was held back for others is used all the same."""
@@ -287,32 +270,20 @@ class SonarMapper(ManagedNode):
         self._mountings.add(event)
         self._drain()
 
-    def _tell_mountings(self) -> None:
-        """Say so where a frame's place is not known, or a sonar looks up or down."""
-        findings = [
-            finding
-            for finding in self._mountings.findings(self._vehicle_id)
-            if finding.severity != "info"
-        ]
-        self._mounting_problem = findings[0].sentence if findings else ""
-        for finding in findings:
-            if finding.sentence not in self._told:
-                self._told.add(finding.sentence)
-                self.get_logger().warning(finding.sentence)
-
     def _feed(self, event: SensorEvent) -> None:
         T_base_sensor = self._mountings.of(event)
-        self._tell_mountings()
+        self._troubles.note_mountings(self._mountings)
         try:
             mounting = correct_mounting(event, T_base_sensor, self._config.conventions)
             submaps = feed_runs(self._runs, event, mounting)
             self._watch.take(event, mounting)
         except InvalidInputError as error:
-            self._complain(f"{type(event).__name__} of {event.frame_id}: {error}")
+            self._troubles.complain(f"{type(event).__name__} of {event.frame_id}: {error}")
             return
         self._outputs.publish_submaps(submaps)
         self._last_pass.look()
-        self._note_breaks()
+        if self._troubles.note_breaks(self._runs):
+            self._odom_stamp_ns = self._map_stamp_ns = 0
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is None:
             return
@@ -324,19 +295,6 @@ class SonarMapper(ManagedNode):
             is_old = stamp_ns - self._map_stamp_ns >= self._config.map_period_s * 1e9
             if is_old and self._drawing.is_due():
                 self._publish_map(stamp_ns)
-
-    def _note_breaks(self) -> None:
-        """Say so where a silence has begun a new run."""
-        for reason in self._runs.breaks[self._num_breaks_told :]:
-            self._odom_stamp_ns = self._map_stamp_ns = 0
-            if reason.role:
-                what = "heading" if reason.role == "imu" else "velocity"
-                self._last_problem = (
-                    f"no {what} for {reason.seconds:.0f} s: a new run begins; what was mapped "
-                    "before is kept, and only registration joins the two"
-                )
-                self.get_logger().warning(self._last_problem)
-        self._num_breaks_told = len(self._runs.breaks)
 
     def _publish_map(self, stamp_ns: int) -> None:
         self._map_stamp_ns = stamp_ns
@@ -379,7 +337,7 @@ class SonarMapper(ManagedNode):
         return (
             f"{self._mapper_values['num_pings']} pings mapped into "
             f"{self._mapper_values['num_submaps']} submaps, {len(drawn_anew)} of them drawn anew; "
-            f"{self._counts['num_bad']} bad messages"
+            f"{self._troubles.counts['num_bad']} bad messages"
         )
 
     def _close_last(self) -> None:
@@ -391,30 +349,21 @@ class SonarMapper(ManagedNode):
 
     def _report(self) -> Report:
         for misfit in self._topics.misfits() if self._topics is not None else ():
-            self._complain(misfit)
-        values = {
-            **dict(sorted((self._counts + self._outputs.counts).items())),
+            self._troubles.complain(misfit)
+        values: dict[str, float | int | str] = {
+            **dict(sorted((self._troubles.counts + self._outputs.counts).items())),
             "num_frames": self._mountings.num_frames,
             "num_late": self._order.num_late,
             "num_waiting": self._worker.num_waiting,
             "num_pings_not_kept": self._last_pass.pings.num_left_out,
             **self._mapper_values,
         }
-        num_pings = self._mapper_values.get("num_pings", 0)
-        problem = self._last_problem or self._problem_of_topics or self._mounting_problem
-        severity: Severity = "info"
-        silence = ""
+        silence: tuple[Severity, str] = ("info", "")
         if not self._is_finished:
-            severity, silence = self._silence.judge(time.monotonic())
-        if conventions := self._watch.sentence:
-            severity = max(severity, "warning", key=SEVERITIES.index)
-            problem = conventions
-        if self._is_paused:
-            return severity, silence or f"paused; {num_pings} pings mapped", values
-        if not num_pings:
-            text = problem or "no ping mapped yet"
-            return max(severity, "warning", key=SEVERITIES.index), silence or text, values
-        return severity, silence or problem or f"{num_pings} pings mapped", values
+            silence = self._silence.judge(time.monotonic())
+        return self._troubles.report(
+            values, silence, self._watch.sentence, is_paused=self._is_paused
+        )
 
 
 def _draw_run_id() -> int:
