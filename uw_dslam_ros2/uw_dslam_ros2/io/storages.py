@@ -6,13 +6,12 @@ and ROS 1 bags. Of a file that was cut off, what is readable is read.
 
 from __future__ import annotations
 
-import heapq
 import shutil
 import sqlite3
 import struct
 import tempfile
 import zlib
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -21,14 +20,22 @@ import apsw
 import yaml
 from backports import zstd
 from rosbags import rosbag1
-from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
-from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.io.damaged_files import (
+    Chunk,
+    DamagedDatabase,
+    DamagedMcap,
+    check_database_size,
+    filled_up,
+    has_log,
+    with_log,
+)
 
 __all__ = ["BROKEN", "Ros1Storage", "Storage", "Storages", "open_storages", "uncompressed"]
 
@@ -55,10 +62,6 @@ _SUFFIXES = (".mcap", ".db3", ".bag")
 _COMPRESSED = (".zstd", ".zst")
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _EXPECTED = "expected a rosbag2 folder, an .mcap or .db3 file, or a ROS 1 .bag"
-_REORDER = 200
-"""Messages of a file without an index that are brought in order at a time."""
-
-Chunk = tuple[Connection, int, bytes]
 
 
 class Storage(Protocol):
@@ -180,9 +183,9 @@ def _expected_count(path: Path) -> int | None:
 
 def _open_folder(path: Path, stack: ExitStack) -> Storage:
     for file in path.glob("*.db3"):
-        if _has_log(file):
+        if has_log(file):
             raise ReaderError(f"{file.name} has a write-ahead log")
-        _check_database_size(file)
+        check_database_size(file)
     return cast(Storage, stack.enter_context(Reader(path)))
 
 
@@ -195,17 +198,17 @@ def _open_file(path: Path, stack: ExitStack) -> tuple[Storage, bool]:
     if path.suffix == ".bag":
         return Ros1Storage(stack.enter_context(rosbag1.Reader(path))), True
     if path.suffix == ".db3":
-        if _has_log(path):
-            path = _with_log(path, stack)
+        if has_log(path):
+            path = with_log(path, stack)
         try:
-            _check_database_size(path)
+            check_database_size(path)
             return cast(Storage, stack.enter_context(Reader(path))), True
         except BROKEN:
-            return _DamagedDatabase(_filled_up(path, stack), stack), False
+            return DamagedDatabase(filled_up(path, stack), stack), False
     try:
         return cast(Storage, stack.enter_context(Reader(path))), True
     except BROKEN:
-        damaged = _DamagedMcap(path)
+        damaged = DamagedMcap(path)
         damaged.open()
         stack.callback(damaged.close)
         return cast(Storage, damaged), False
@@ -219,176 +222,6 @@ def _decompressed(path: Path, stack: ExitStack) -> tuple[Path, bool]:
         except (EOFError, zstd.ZstdError):
             return target, False
     return target, True
-
-
-# --- sqlite3
-# -----------------------------------------------------------------------------------------------
-
-
-def _check_database_size(file: Path) -> None:
-    """Sqlite itself notices missing pages only when a query happens to need them."""
-    with file.open("rb") as stream:
-        header = stream.read(100)
-    if len(header) < 100:
-        raise ReaderError(f"{file.name} has no database header")
-    page_size, num_pages = struct.unpack(">16xH10xI", header[:32])
-    # A page size of 1 stands for 65536.
-    expected = (65536 if page_size == 1 else page_size) * num_pages
-    if (size := file.stat().st_size) < expected:
-        raise ReaderError(f"{file.name} has {size} of {expected} bytes")
-
-
-def _filled_up(file: Path, stack: ExitStack) -> Path:
-    """A copy of the length that its header tells of: else sqlite refuses all of it."""
-    copy = Path(stack.enter_context(tempfile.TemporaryDirectory())) / file.name
-    shutil.copy2(file, copy)
-    with copy.open("r+b") as stream:
-        page_size, num_pages = struct.unpack(">16xH10xI", stream.read(32))
-        stream.truncate(
-            max(file.stat().st_size, (page_size if page_size > 1 else 65536) * num_pages)
-        )
-    return copy
-
-
-def _log_of(file: Path) -> Path:
-    return file.with_name(f"{file.name}-wal")
-
-
-def _has_log(file: Path) -> bool:
-    return _log_of(file).is_file() and _log_of(file).stat().st_size > 0
-
-
-def _with_log(file: Path, stack: ExitStack) -> Path:
-    """A copy that holds what still lies in the log: the user's own files are only read."""
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-    for source in (file, _log_of(file)):
-        shutil.copy2(source, folder / source.name)
-    copy = folder / file.name
-    with sqlite3.connect(copy) as connection:
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        connection.execute("PRAGMA journal_mode=DELETE")
-    connection.close()
-    return copy
-
-
-class _DamagedDatabase:
-    """As many messages of a database as can be read from its beginning; perhaps none."""
-
-    def __init__(self, path: Path, stack: ExitStack) -> None:
-        self._database = apsw.Connection(
-            f"file:{path}?immutable=1", flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
-        )
-        stack.callback(self._database.close)
-        columns = [row[1] for row in self._database.execute("PRAGMA table_info(topics)")]
-        if not columns:
-            raise ReaderError(f"{path.name} has no topics")
-        definitions = self._definitions()
-        counts: dict[int, int] = {}
-        stamps: list[int] = []
-        for topic_id, stamp_ns in self._readable("topic_id, timestamp"):
-            counts[topic_id] = counts.get(topic_id, 0) + 1
-            stamps.append(stamp_ns)
-        self.connections = [
-            Connection(
-                topic_id, topic, msgtype, definitions.get(msgtype, _NO_DEFINITION), "",
-                counts.get(topic_id, 0), cast(Any, None), cast(Any, self),
-            )
-            for topic_id, topic, msgtype in cast(
-                "list[tuple[int, str, str]]",
-                self._database.execute("SELECT id, name, type FROM topics ORDER BY id").fetchall(),
-            )
-        ]  # fmt: skip
-        self.message_count = len(stamps)
-        self.start_time = min(stamps, default=0)
-        self.end_time = max(stamps, default=0) + 1
-
-    def _definitions(self) -> dict[str, MessageDefinition]:
-        formats = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
-        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        try:
-            rows = cast("list[tuple[str, str, str]]", self._database.execute(query).fetchall())
-        except apsw.Error:  # earlier versions have none
-            return {}
-        return {name: MessageDefinition(formats[code], text) for name, code, text in rows}
-
-    def _readable(self, columns: str) -> Iterator[tuple[Any, ...]]:
-        try:
-            # Of a row that was cut in two, nothing is known.
-            yield from self._database.execute(
-                f"SELECT {columns} FROM messages NOT INDEXED "
-                "WHERE topic_id IS NOT NULL AND timestamp > 0 ORDER BY id"
-            )
-        except apsw.Error:
-            return
-
-    def messages(
-        self, connections: Collection[Connection], start: int | None, stop: int | None
-    ) -> Iterator[Chunk]:
-        """As `Storage` says."""
-        wanted = {connection.id: connection for connection in connections}
-        for topic_id, stamp_ns, data in self._readable("topic_id, timestamp, data"):
-            is_late = stop is not None and stamp_ns >= stop
-            if topic_id in wanted and stamp_ns >= (start or 0) and not is_late:
-                yield wanted[topic_id], stamp_ns, data
-
-
-_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
-
-
-# --- MCAP
-# -----------------------------------------------------------------------------------------------
-
-
-class _DamagedMcap(McapReader):
-    """All complete records of a file without its end."""
-
-    message_count = start_time = end_time = 0
-
-    def _open(self) -> None:
-        assert self.bio is not None
-        if self.bio.read(8) != b"\x89MCAP0\r\n":
-            raise ReaderError("it does not begin as an MCAP file does")
-        self.data_start = 8
-        self.data_end = self._end_of_records(self.path.stat().st_size)
-        self.meta_scan()
-        assert self.statistics is not None
-        counts = self.statistics.channel_message_counts
-        self.connections = [c._replace(msgcount=counts.get(c.id, 0)) for c in self.connections]
-        self.message_count = self.statistics.message_count
-        self.start_time, self.end_time = self.statistics.start_time, self.statistics.end_time + 1
-
-    def _end_of_records(self, size: int) -> int:
-        """Where the last complete record of data ends; a summary is not needed."""
-        assert self.bio is not None
-        position = self.data_start
-        data_end_code, footer_code = 0x0F, 0x02
-        while position + 9 <= size:
-            self.bio.seek(position)
-            code, length = struct.unpack("<BQ", self.bio.read(9))
-            if code in (data_end_code, footer_code) or code == 0:
-                break
-            if position + 9 + length > size:
-                break
-            position += 9 + length
-        return position
-
-    def messages(
-        self,
-        connections: Collection[Connection],
-        start: int | None = None,
-        stop: int | None = None,
-    ) -> Generator[Chunk, None, None]:
-        """As `Storage` says; recorders write nearly in order."""
-        waiting: list[tuple[int, int, Connection, bytes]] = []
-        scan = self.messages_scan(connections, start, stop)
-        for number, (connection, stamp_ns, data) in enumerate(scan):
-            heapq.heappush(waiting, (stamp_ns, number, connection, data))
-            if len(waiting) > _REORDER:
-                first = heapq.heappop(waiting)
-                yield first[2], first[0], first[3]
-        while waiting:
-            first = heapq.heappop(waiting)
-            yield first[2], first[0], first[3]
 
 
 # --- ROS 1
