@@ -31,13 +31,13 @@ def make(node_type, context, namespace=None, **settings):
     return node_type(context=context, parameter_overrides=parameters, **names)
 
 
-def make_link(context, number, **settings):
+def make_link(context, number, time_scale=2.0, **settings):
     return make(
         AcousticLinkNode,
         context,
         f"auv_{number}",
         link__number=number,
-        time_scale=2.0,
+        time_scale=time_scale,
         **settings,
     )
 
@@ -51,18 +51,18 @@ def fleet(ros_context, spinning):
     import contextlib
 
     @contextlib.contextmanager
-    def run(state="", blackouts_s=None, **channel):
+    def run(state="", blackouts_s=None, time_scale=2.0, **channel):
         run.water = water = make(
             ChannelNode,
             ros_context,
             vehicles=["auv_1", "auv_2"],
-            time_scale=2.0,
+            time_scale=time_scale,
             **({"blackouts_s": blackouts_s} if blackouts_s else {}),
             **{f"channel__{name}": value for name, value in channel.items()},
         )
         run.links = links = [
-            make_link(ros_context, 1),
-            make_link(ros_context, 2, state=state),
+            make_link(ros_context, 1, time_scale),
+            make_link(ros_context, 2, time_scale, state=state),
         ]
         probe = rclpy.create_node("probe", context=ros_context)
         outputs, got = {}, {1: {}, 2: {}}
@@ -120,13 +120,13 @@ def test_a_submap_that_is_drawn_anew_moves_and_is_not_sent_once_more(fleet):
 
 
 def test_nothing_arrives_in_a_blackout_and_all_of_it_afterwards(fleet):
-    with fleet(blackouts_s=[0.0, 8.0]) as (until, send, got):
+    with fleet(blackouts_s=[0.0, 16.0], time_scale=8.0) as (until, send, got):
         send(room_submap("auv_1", 0))
         until(lambda: fleet.water._report()[2]["blacked out"] > 0, "a packet that is lost")
         assert not got[2]
         # Where all of it was sent in the blackout, a heartbeat is what gets it going again.
         until(lambda: got[2], "the submap", deadline_s=120.0)
-        assert fleet.water._now_s() > 8.0
+        assert fleet.water._now_s() > 16.0
 
 
 def test_a_link_goes_on_where_it_was_stopped(ros_context, spinning, tmp_path):

@@ -43,8 +43,7 @@ def messages():
 
 ORDERS = {
     "in turn": (0, 2, 4, 1, 3, 5, 6),
-    "backwards": (6, 5, 4, 3, 2, 1, 0),
-    "mixed, and some twice": (3, 6, 4, 4, 0, 2, 5, 1, 3, 6),
+    "backwards, and some twice": (6, 5, 4, 4, 3, 2, 6, 1, 0, 3),
 }
 
 
