@@ -22,6 +22,7 @@ from uw_dslam_ros2.core.registration.grids.judging.probability import (
     PoseEvidence,
     pose_logit,
     probability_of,
+    rival_probability,
 )
 from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
 from uw_dslam_ros2.core.registration.grids.problem import build_problem
@@ -125,10 +126,21 @@ def test_a_rival_as_convincing_is_ambiguous_however_low_its_score():
 
 
 def test_of_two_poses_that_nothing_tells_apart_each_has_half_of_the_probability():
-    rival = replace(GOOD.best, score=0.4)
-    alone = probability_of(replace(GOOD, rivals=(replace(POOR, score=0.4),)))
+    evidence = replace(GOOD, rivals=(replace(GOOD.best, score=0.4),))
+    alone = probability_of(evidence, is_alone=True)
     assert alone > 0.9
-    assert probability_of(replace(GOOD, rivals=(rival,))) == pytest.approx(0.5 * alone, abs=0.01)
+    assert probability_of(evidence) == pytest.approx(0.5 * alone, abs=0.01)
+
+
+def test_a_match_that_rivals_all_but_reach_is_less_probable_for_itself():
+    """Even where none of them is as convincing: accident has made such poses, too."""
+    told = []
+    for agreement, conflict in ((0.6, 0.2), (0.86, 0.1), (0.88, 0.07)):
+        rival = PoseEvidence(_agreement(agreement=agreement, conflict=conflict), 0.4, 3.0)
+        evidence = replace(GOOD, best=replace(GOOD.best, surprise=3.0), rivals=(rival,))
+        assert rival_probability(evidence) < 0.6
+        told.append(probability_of(evidence, is_alone=True))
+    assert told[0] > told[1] > told[2]
 
 
 def test_what_is_stated_does_not_leap_where_a_verdict_turns():

@@ -64,7 +64,7 @@ _RIDGE = 1.0
 # Which way a feature may speak, if at all; where few pairs tell, chance must not turn it round.
 _SIGNS = {
     "agreement": 1, "conflict": -1, "log_detail": 1, "wall_share": -1, "log_surprise": 1,
-    "log_volume": -1, "pose": 1, "lead": 1,
+    "log_volume": -1, "pose": 1, "lead": 1, "margin": 1,
 }  # fmt: skip
 _OTHER_WEIGHT = 0.3  # of poses beside that of the highest score: there are several in each pair
 _APART_BINS = (0.05, 0.2, 0.4, 0.5, 1.01)

@@ -88,8 +88,9 @@ POSE_FEATURES = (
     "log_surprise",
     "log_volume",
 )
-MATCH_FEATURES = ("pose", "lead")
+MATCH_FEATURES = ("pose", "lead", "margin")
 _RIVAL_SHARES = (0.2, 2.0)  # beyond, a rival's score says no more
+_MOST_MARGIN = 3.0  # logits; beyond, a rival's evidence says no more
 _MOST_LOGIT = 12.0
 _ONE_OF_TWO = 0.5
 # How often one of two maps has left and right exchanged [logit]: one time in fourteen.
@@ -109,17 +110,16 @@ class VerdictModels:
 
 MODELS = VerdictModels(
     pose=(-1.3292, 1.9783, -20.1197, 0.7012, -4.7006, 2.4299, -0.2288),
-    match=(0.0385, 0.8333, 2.4656),
+    match=(-1.772, 0.8379, 2.2163, 0.7473),
 )
 """Fitted by the model fit of `study verdict`, each place weighed as one.
 
 The model of a pose is of 1,891 answers: 364 of windows of simulated places, 276 of maps of
 simulated places that were built apart, 1,251 of real maps; the slope of ``log_volume`` is held at
-what windows with and without priors gave before. The model of a match is of 2,321 answers of the
-evidence as it is measured today: 951 of windows of simulated places, 360 of them in a mirror and
-123 with a prior; 1,370 of real maps, 528 of them in a mirror, 288 windows of lidar maps, and 290
-pairs of different places. The real maps are public ones and no part of this repository; a list of
-one's own goes to `--pairs`.
+what windows with and without priors gave before. The model of a match is of 2,755 answers: 1,125
+of simulated places, 360 of them in a mirror and 123 with a prior; 1,630 of real maps, 528 of them
+in a mirror, 288 windows of lidar maps, and 550 pairs of different places. The real maps are public
+ones and no part of this repository; a list of one's own goes to `--pairs`.
 docs/experiments.md has what other fits would change.
 """
 
@@ -140,12 +140,16 @@ def pose_features(pose: PoseEvidence, log_volume: float) -> tuple[float, ...]:
 def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tuple[float, ...]:
     """Quantities that speak for or against the best pose in view of the others.
 
-    Its logit for itself, and the logarithm of how many times it scores any other pose: where two
-    maps do not belong together, their best poses score alike.
+    Its logit for itself, the logarithm of how many times it scores any other pose, and by how much
+    its logit exceeds that of the most alike of them. Where two maps do not belong together, their
+    best poses score and convince alike; where they share little, the right one scores less than
+    many, but convinces.
     """
     best = _logit(pose_model, pose_features(evidence.best, evidence.log_volume))
     least, most = _RIVAL_SHARES
-    return best, -math.log(min(max(evidence.rival_share, least), most))
+    lead = -math.log(min(max(evidence.rival_share, least), most))
+    margin = best - _most_alike(evidence, pose_model)
+    return best, lead, min(max(margin, 0.0), _MOST_MARGIN)
 
 
 def _most_alike(evidence: MatchEvidence, pose_model: Sequence[float]) -> float:
