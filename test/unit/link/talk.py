@@ -5,9 +5,12 @@ from uw_dslam_ros2.core.link.transport.channel import ChannelConfig, SharedChann
 
 
 class Talk:
-    """Vehicles 1, 2, ... a hundred metres apart; `run` lets time pass."""
+    """Vehicles 1, 2, ... a hundred metres apart; `run` lets time pass.
 
-    def __init__(self, num=3, packet_bytes=64, blackouts=(), **channel):
+    `clocks` says by how much some are ahead [s].
+    """
+
+    def __init__(self, num=3, packet_bytes=64, blackouts=(), clocks=None, **channel):
         config = ChannelConfig(packet_bytes=packet_bytes, **channel)
         self.channel = SharedChannel(config, range(1, num + 1), blackouts)
         self.links = {
@@ -15,6 +18,7 @@ class Talk:
             for n in range(1, num + 1)
         }
         self.where = {n: (100.0 * n, 0.0) for n in self.links}
+        self.clocks = dict.fromkeys(self.links, 0.0) | (clocks or {})
         self.now_s = 0.0
         self.got = {n: {} for n in self.links}
         self.packets = []
@@ -27,14 +31,17 @@ class Talk:
         for submap in submaps:
             self.got[number][submap.submap_id] = submap
 
+    def _hear(self, number, data, at_s):
+        return self.links[number].receive(data, at_s + self.clocks[number])
+
     def run(self, until_s):
         turns = {n: self.channel.next_turn(n, self.now_s) for n in self.links}
         while (now_s := min(turns.values())) < until_s:
             number = min(turns, key=lambda n: (turns[n], n))
             for at_s, receiver, data in self.channel.arrived(now_s):
                 if receiver in self.links:
-                    self._note(receiver, self.links[receiver].receive(data, at_s))
-            packet = self.links[number].next_packet(now_s)
+                    self._note(receiver, self._hear(receiver, data, at_s))
+            packet = self.links[number].next_packet(now_s + self.clocks[number])
             if packet is not None:
                 self.packets.append((now_s, number, packet))
                 self.channel.send(number, [packet], now_s, self.where)

@@ -12,6 +12,7 @@ from unit.link.talk import Talk
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.link import AcousticLink, Layer, LinkConfig
+from uw_dslam_ros2.core.link.coding.fields import digest_of
 from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -87,6 +88,31 @@ def test_losses_are_repaired_and_cost_little_more_than_they_must(seed):
     sent = [item.num_sent for link in talk.links.values() for item in link._outbox.items]
     # Until two receivers who miss 30 % each have all of one fragment takes 1.76 on average.
     assert sum(sent) < 2.2 * sum(parts)
+
+
+def test_clocks_that_disagree_change_no_packet_and_no_submap():
+    talks = []
+    for clocks in (None, {1: 5.0, 3: -4000.0}):
+        talk = Talk(clocks=clocks, loss=0.3)
+        for number in talk.links:
+            for sequence in range(2):
+                submap, shift_ns = own_submap(number, sequence), int(1e9 * talk.clocks[number])
+                stamps_ns = submap.trajectory_stamp_ns + shift_ns + 5000 * 10**9
+                talk.add(
+                    dataclasses.replace(
+                        submap, stamp_ns=int(stamps_ns[-1]), trajectory_stamp_ns=stamps_ns
+                    )
+                )
+        talk.until_all_know(6, 400.0)
+        assert same_everywhere(talk)
+        talks.append(talk)
+    first, second = (
+        [(now_s, number, len(data)) for now_s, number, data in talk.packets] for talk in talks
+    )
+    assert first == second
+    assert {content(s) for s in talks[0].got[2].values()} == {
+        content(s) for s in talks[1].got[2].values()
+    }
 
 
 def test_aloha_collides_and_arrives_all_the_same():
@@ -253,6 +279,15 @@ def test_packets_with_a_sound_checksum_and_any_content_harm_nothing(rng):
         assert link.receive(Packet(*fields, payload).pack(b""), 0.0) == []
     assert list(link.submaps()) == []
     assert link.counts.refused
+
+
+def test_packets_of_another_version_are_refused():
+    link = AcousticLink(LinkConfig(number=1), "auv_1")
+    data = AcousticLink(LinkConfig(number=2), "auv_2").next_packet(0.0)
+    content = bytes([data[0] ^ 0x40]) + data[1:-2]
+    assert link.receive(content + digest_of(content, b"", 2), 0.0) == []
+    assert link.counts.refused == {"version of the": 1}
+    assert link.age_s(2, 0.0) is None
 
 
 def test_who_lacks_the_key_is_not_heard():

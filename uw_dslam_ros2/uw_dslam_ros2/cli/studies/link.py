@@ -2,8 +2,10 @@
 
 The default demo's missions, mapped once for each seed. Their submaps go over a simulated channel
 that all vehicles share, from the moment on in which each is closed. Merging works on what was
-sent, at both ends alike, so that whoever has received the same has the same map; the table shows
-when everybody had everything, and what the merged map is worth beside one of full grids. For
+sent, at both ends alike, so that whoever has received the same has the same map; the tables show
+when everybody had everything, when the first vehicle could first join another, and what the merged
+map is worth beside one of full grids: with everything, and with what all have a minute (1000
+bit/s), five (nano) or twenty (rate0) after the last ping. Five missions take some ten minutes. For
 comparison the bits that descriptors of 16 bytes and a cloud of 9 kbit for each submap that is
 matched (DRACo-SLAM's budget) would take.
 """
@@ -27,7 +29,7 @@ from uw_dslam_ros2.cli.studies._common import (
     write_csv,
 )
 from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission, demo_mission
-from uw_dslam_ros2.cli.studies.merging import merged_largest, placing_error
+from uw_dslam_ros2.cli.studies._link_joining import Joining, known_by
 from uw_dslam_ros2.core.link import Layer, LayeredSubmap, encode_submap
 from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig
 from uw_dslam_ros2.core.submap import Submap
@@ -43,6 +45,8 @@ _WAYS = {
     "0.3 m, walls of 0.1 m": Layer.FINE,
 }
 _CLOUD_BYTES, _DESCRIPTOR_BYTES = 9000 // 8, 16
+_DUE_S = {"1000 bit/s": 60.0, "nano": 300.0, "rate0": 1200.0}
+"""After the last ping: what is joined by then, of channels by the beginning of their names."""
 _SHARED_RATE = 1500.0  # while a modem sends; 1000 bit/s with the pauses of 64-byte packets
 
 
@@ -62,8 +66,9 @@ def run(args: argparse.Namespace) -> int:
     merged: list[dict[str, Any]] = []
     for seed in progress(range(args.first_seed, args.first_seed + args.seeds), text="missions"):
         mission = demo_mission(seed, args.out / "cache")
+        joining = None if args.no_merging else Joining(mission)
         sizes += [_sizes(mission.name, submap) for submap in mission.submaps]
-        merged += [] if args.no_merging else _merged_rows(mission)
+        merged += [] if joining is None else _merged_rows(joining)
         for name, (channel, blackouts) in _channels(args.loss, mission.submaps).items():
             played = run_link(
                 mission.submaps,
@@ -73,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
             )
             runs.setdefault(name, played)
             rows.append(_row(mission, name, played))
+            if joining is not None and not blackouts and channel.access == "tdma":
+                merged += _due_rows(joining, name, played)
     write_csv(args.out / "link.csv", rows)
     write_csv(args.out / "sizes.csv", sizes)
     _draw_known(runs, args.out / "link.png")
@@ -138,26 +145,42 @@ def _row(mission: FleetMission, name: str, played: LinkRun) -> dict[str, Any]:
     }
 
 
-def _merged_rows(mission: FleetMission) -> list[dict[str, Any]]:
+def _merged_rows(joining: Joining) -> list[dict[str, Any]]:
     """The map of full grids beside that of each layer, for everybody who has it all."""
-    found: list[dict[str, Any]] = []
+    mission, found = joining.mission, []
     for name, layer in _WAYS.items():
-        crossed = []
-        for submap in mission.submaps:
-            crossed.append((submap, 0) if layer is None else _crossed(submap, layer))
-        sent = FleetMission(mission.name, tuple(pair[0] for pair in crossed), mission.truth)
-        placing, _ = merged_largest(sent)
+        crossed = [
+            (submap, 0) if layer is None else _crossed(submap, layer) for submap in mission.submaps
+        ]
         num_bytes = sum(pair[1] for pair in crossed)
-        found.append(
-            {
-                "mission": mission.name,
-                "sent": name,
-                "kB": round(num_bytes / 1000, 1) if num_bytes else "",
-                "vehicles": len({submap_id.vehicle_id for submap_id in placing}),
-                "rmse_m": round(placing_error(sent, placing), 3),
-            }
-        )
+        row = _merged_row(joining, name, [pair[0] for pair in crossed])
+        found.append(row | {"kB": round(num_bytes / 1000, 1) if num_bytes else ""})
     return found
+
+
+def _due_rows(joining: Joining, name: str, played: LinkRun) -> list[dict[str, Any]]:
+    """What all could merge when they should be done, and when the first one joined another."""
+    for channel, due_s in _DUE_S.items():
+        if name.startswith(channel):
+            vehicles = sorted(played.known)
+            known = known_by(played, vehicles, played.end_s + due_s)
+            first_s = joining.first_join_s(played, vehicles[0])
+            row = _merged_row(joining, f"{name}: {due_s:g} s after the last ping", known)
+            return [row | {"first_join_s": "" if first_s is None else round(first_s, 1)}]
+    return []
+
+
+def _merged_row(joining: Joining, name: str, submaps: Sequence[Submap]) -> dict[str, Any]:
+    merged = joining.merged(submaps)
+    return {
+        "mission": joining.mission.name,
+        "sent": name,
+        "kB": "",
+        "submaps": len(submaps),
+        "vehicles": merged.num_vehicles,
+        "rmse_m": round(merged.rmse_m, 3),
+        "first_join_s": "",
+    }
 
 
 def _crossed(submap: Submap, finest: Layer) -> tuple[Submap, int]:

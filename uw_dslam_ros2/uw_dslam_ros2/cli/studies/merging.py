@@ -219,12 +219,14 @@ def _largest(queue: MapQueue) -> Placing:
     return max(groups.values(), key=len)
 
 
-def merged_largest(mission: FleetMission) -> tuple[Placing, set[SubmapId]]:
-    """Largest group of submaps that the engine joins: their poses, and who was matched."""
+def merged_largest(
+    mission: FleetMission, match: Callable[[MatchRequest], RegistrationResult] = _engine
+) -> tuple[Placing, set[SubmapId]]:
+    """Largest group of submaps that are joined: their poses, and who was matched."""
     queue = MapQueue()
     for submap in mission.submaps:
         queue.add_submap(submap)
-    answer_all(queue, _engine)
+    answer_all(queue, match)
     matched = {
         submap_id
         for answer, is_used in queue.answers()

@@ -2,8 +2,9 @@
 
 Whole numbers only, so that sender and receiver need not be of one make: every probability comes
 out alike on every processor. The coder is one loop for both ways, which cannot disagree with
-itself. (`constriction`, the library that comes to mind, takes its probabilities as floats and one
-call from Python for each adaptive symbol, and is not in Ubuntu's packages.)
+itself. (`constriction`, the library that comes to mind, takes its probabilities as floats, and one
+call from Python for each adaptive symbol, of which a submap has 49,000; it is not in Ubuntu's
+packages either.)
 """
 
 from __future__ import annotations
