@@ -90,6 +90,21 @@ def test_the_trajectory_moves_with_its_pings(run):
     assert np.hypot(*(moved[-1] - moved[0])[:2]) > 0.03
 
 
+@pytest.mark.parametrize("resolution_m", [0.1, 0.25])
+def test_a_wall_takes_one_cell_where_cells_are_large_and_has_no_gap(resolution_m):
+    rng = np.random.default_rng(2)
+    starts = [STARTS[0] @ SE2(0.25 * i, 0.0, 0.0) for i in range(12)]
+    own = [pack_ping(corner_seen_from(T, i, rng), T) for i, T in enumerate(starts)]
+    track = PingTrack(own, np.array([T.as_array() for T in starts]))
+    chart = draw_chart([track], OccupancyConfig(resolution_m=resolution_m), 8.0)
+    walls = chart.spec.centers_of(np.argwhere(chart.values > 50))
+    across = walls[np.abs(walls[:, 0] - WALLS_M[0]) < 0.3]
+    middle = across[(across[:, 1] > 0.0) & (across[:, 1] < 5.0)]
+    _, counts = np.unique(np.floor(middle[:, 1] / resolution_m).astype(int), return_counts=True)
+    assert len(counts) == round(5.0 / resolution_m)
+    assert counts.mean() < 1.6
+
+
 def test_without_pings_nothing_changes(run):
     outcome, _ = run
     assert charted(outcome, {}, OccupancyConfig()) is outcome
@@ -111,7 +126,7 @@ def test_a_chart_drawn_in_blocks_is_the_whole_chart(run, monkeypatch, side):
     _, pings = run
     own = [ping for pings_of_submap in pings.values() for ping in pings_of_submap]
     poses = np.array([(1.5 * k, -0.7 * k, 0.4 * k) for k in range(len(own))])
-    whole = GrowingGrid(CONFIG, share_against=drawing.SHARE_AGAINST)
+    whole = GrowingGrid(CONFIG, share_against=drawing.SHARE_AGAINST, face_cells=0.5)
     for ping, pose in zip(own, poses, strict=True):
         whole.add(ping.detections(), SE2.from_array(pose))
     expected = whole.trimmed().to_occupancy(8.0)

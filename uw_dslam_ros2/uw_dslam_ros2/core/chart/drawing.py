@@ -34,6 +34,8 @@ _BLOCK_SIDE = 2048
 SHARE_AGAINST = 0.4
 """What a ping that looked through a wall says against it: most beams that meet a wall slantwise
 miss it, ping after ping. A submap, of a few pings, has to be sure of its walls."""
+_FACE_M = 0.05
+"""How far from its crest a face is drawn: where cells are larger, each crest takes one of them."""
 _ROUNDED = 5
 """Digits kept of metres and radians: an equation's last digits depend on the machine."""
 
@@ -120,10 +122,11 @@ def draw_chart(
             f"{config.resolution_m:g} m, expected at most {MAX_MAP_SIDE} a side"
         )
     values = np.full(whole.shape, UNKNOWN, np.int8)
+    face_cells = min(1.0, max(0.5, _FACE_M / config.resolution_m))
     for block in _blocks(whole):
         near = [p for p, own in zip(pings, reach, strict=True) if _meet(own, block)]
         if near:
-            grid = GrowingGrid(config, _grown(block), SHARE_AGAINST)
+            grid = GrowingGrid(config, _grown(block), SHARE_AGAINST, face_cells)
             for ping, scale, motion in near:
                 grid.add(ping.detections(scale), motion)
             drawn, percent = grid.percent(log_odds_max)

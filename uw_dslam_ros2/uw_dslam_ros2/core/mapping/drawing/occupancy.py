@@ -34,8 +34,6 @@ _MAX_SPREAD_M = 0.5
 
 _LEAST_SIGMA_CELLS = 0.8
 """Least spread of an echo: a narrower heap of echoes has no shape on the lattice."""
-_FACE_CELLS = 1.0
-"""How far from the crest of the echoes a cell still belongs to a wall's face."""
 _SMOOTHING = np.array([math.comb(8, k) for k in range(9)], np.int64)
 """In the form of a Gaussian of 1.4 cells, about as wide as the echoes of one face scatter."""
 _MARGIN_CELLS = len(_SMOOTHING) // 2 + 1
@@ -65,6 +63,8 @@ class GrowingGrid:
     share_against
         A ping that looked through a wall's face counts against it with that share of what it
         says of water.
+    face_cells
+        How far from the crest of the echoes a cell still belongs to a wall's face.
     """
 
     def __init__(
@@ -72,8 +72,10 @@ class GrowingGrid:
         config: OccupancyConfig = OccupancyConfig(),  # noqa: B008 (frozen)
         only: Window | None = None,
         share_against: float = 1.0,
+        face_cells: float = 1.0,
     ) -> None:
         self._config = config
+        self._face_cells = face_cells
         self._share_against = share_against
         self._is_fixed = only is not None
         window = only or Window(0, 0, 0, 0)
@@ -165,7 +167,7 @@ class GrowingGrid:
                 _SMOOTHING_GAIN,
                 round(free),
                 round(self._share_against * free),
-                _FACE_CELLS,
+                self._face_cells,
                 _TAIL_REACH_CELLS,
                 _TAIL_SHARE,
             )
