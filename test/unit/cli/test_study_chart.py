@@ -13,8 +13,10 @@ def test_every_stage_is_drawn_and_scored(tmp_path, capsys):
     assert main(["chart", "--out", str(tmp_path), *arguments]) == 0
     with (tmp_path / "chart.csv").open() as file:
         rows = {row["stage"]: row for row in csv.DictReader(file)}
-    assert len(rows) == 10
+    assert len(rows) == 11
     ideal = float(rows["all true: poses, mounting, sound, echoes"]["IoU cell"])
     found = float(rows["last pass, poses refined: offline's chart"]["IoU cell"])
     assert ideal > found > 0.0
-    assert "| drawn with" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| drawn with" in printed
+    assert "| harbour, seed 0 | 1 of 1 | chart" in printed

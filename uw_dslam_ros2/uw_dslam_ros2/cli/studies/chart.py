@@ -2,8 +2,8 @@
 
 Simulated missions are mapped and merged as by `offline`; then the chart is drawn again with true
 poses, true echoes, narrow beams and so on in the place of what was found. Thickness in cells,
-agreement with the true walls within 0.25 m and cell by cell, walls that are none, and walls that
-are missing.
+agreement with the true walls within 0.25 m and cell by cell, walls that are none, walls that are
+missing, and the error of the trajectories that the map was drawn along.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 
 from uw_dslam_ros2.cli.common import num_processors
-from uw_dslam_ros2.cli.reporting.outcome import outcome_of
+from uw_dslam_ros2.cli.reporting.outcome import Outcome, outcome_of
 from uw_dslam_ros2.cli.reporting.scoring import WALL_TOLERANCE_M
 from uw_dslam_ros2.cli.running.charting import chart_tracks, charted
 from uw_dslam_ros2.cli.running.mapping import OfflineConfig, map_recordings, settle
 from uw_dslam_ros2.cli.studies._common import print_table, progress, write_csv
 from uw_dslam_ros2.core.chart.drawing import PingTrack, draw_chart
+from uw_dslam_ros2.core.chart.pings import DrawnPing
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import UNITS_PER_NAT, OccupancyMap
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
@@ -32,9 +33,15 @@ from uw_dslam_ros2.core.mapping.drawing.log_odds_grid import LogOddsGrid
 from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.merging.config import LOG_ODDS_MAX
-from uw_dslam_ros2.core.metrics import compare_maps, map_sharpness, trajectory_error
+from uw_dslam_ros2.core.metrics import (
+    Trajectory,
+    TrajectoryError,
+    compare_maps,
+    map_sharpness,
+    trajectory_error,
+)
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.submap import Track
+from uw_dslam_ros2.core.submap import SubmapId, Track
 from uw_dslam_ros2.io.maps.files import read_map
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.trajectories import read_tum
@@ -47,48 +54,67 @@ from uw_dslam_ros2.sim.missions.mission import (
     plan_mission,
 )
 from uw_dslam_ros2.sim.missions.recording import simulate_mission
-from uw_dslam_ros2.sim.waters.places import PLACES
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["MappedMission", "add_arguments", "map_mission", "print_tables", "run", "stages"]
 
 Row = dict[str, Any]
 Tracks = Mapping[Track, PingTrack]
+Pings = Mapping[SubmapId, Sequence[DrawnPing]]
 _NUM_NARROW = 10
 _THRESHOLDS_PERCENT = (50, 60, 70, 80, 90, 97)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the study."""
-    parser.add_argument("--seeds", type=int, default=1, help="missions (%(default)s)")
+    parser.add_argument("--seeds", type=int, default=1, help="harbours (%(default)s)")
+    parser.add_argument("--lakes", type=int, default=0, help="lakes beside them (%(default)s)")
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--place", choices=PLACES, default="harbour")
     parser.add_argument("--vehicles", type=int, default=MissionConfig().num_vehicles)
     parser.add_argument("--duration", type=float, default=MissionConfig().duration_s, metavar="S")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, map, draw again and again; print the means over missions, save every row."""
+    """Simulate, map, draw again and again; print means and missions, save every row."""
     rows: list[Row] = []
-    for seed in progress(range(args.first_seed, args.first_seed + args.seeds), text="missions"):
+    missions = [(place, args.first_seed + i) for place, n in _counts(args) for i in range(n)]
+    for place, seed in progress(missions, text="missions"):
         config = MissionConfig(
-            seed=seed,
-            place=args.place,
-            num_vehicles=args.vehicles,
-            duration_s=args.duration,
+            seed=seed, place=place, num_vehicles=args.vehicles, duration_s=args.duration
         )
         with tempfile.TemporaryDirectory() as work:
-            rows += [{"seed": seed, **row} for row in _stages(config, Path(work))]
+            rows += stages(map_mission(config, Path(work)))
         write_csv(args.out / "chart.csv", rows)
-    stages = list(dict.fromkeys(row["stage"] for row in rows))
-    table = []
-    for stage in stages:
-        own = [row for row in rows if row["stage"] == stage]
-        means = {key: np.mean([row[key] for row in own]) for key in own[0] if key in _FORMATS}
-        table.append([stage, *(f"{means[key]:{form}}" for key, form in _FORMATS.items())])
-    print_table(["drawn with", *_FORMATS], table)
+    print_tables(rows)
     return 0
 
 
+def _counts(args: argparse.Namespace) -> list[tuple[str, int]]:
+    return [("harbour", args.seeds), ("lake", args.lakes)]
+
+
+def print_tables(rows: Sequence[Row]) -> None:
+    """Means of each stage over the missions, and of each mission what is before and after."""
+    table = []
+    for stage in dict.fromkeys(row["stage"] for row in rows):
+        own = [row for row in rows if row["stage"] == stage]
+        means = {key: np.mean([row[key] for row in own]) for key in _FORMATS}
+        table.append([stage, *(f"{means[key]:{form}}" for key, form in _FORMATS.items())])
+    print_table(["drawn with", *_FORMATS], table)
+    table = [
+        [
+            row["mission"],
+            row["merged"],
+            name,
+            *(f"{row[k]:{form}}" for k, form in _FORMATS.items()),
+        ]
+        for row in rows
+        for stage, name in ((_LIVE, "live"), (_CHART, "chart"))
+        if row["stage"] == stage
+    ]
+    print_table(["mission", "merged", "map", *_FORMATS], table)
+
+
+_LIVE, _CHART = "sum of rigid submaps, as merged live", "last pass, poses refined: offline's chart"
 _FORMATS = {
     "thickness [cells]": ".2f",
     "IoU 0.25 m": ".3f",
@@ -97,30 +123,40 @@ _FORMATS = {
     "recall": ".3f",
     "MSE": ".4f",
     "SSIM": ".3f",
+    "trajectory [m]": ".3f",
 }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Mapped:
+class MappedMission:
     """A mission, what became of it, and what is true."""
 
     mission: Mission
-    summed_map: OccupancyMap
-    graph: Tracks
-    tracks: Tracks
+    outcome: Outcome
+    pings: Pings
     truth_map: OccupancyMap
-    T_truth_graph: SE2
-    T_truth_map: SE2
+    truth: Mapping[str, Trajectory]
     occupancy: OccupancyConfig
 
     def run_of(self, track: Track) -> VehicleRun:
         """What the simulator knows of a vehicle."""
         return next(r for r in self.mission.runs if r.vehicle_id == track.vehicle_id)
 
-    def row(self, stage: str, drawn: OccupancyMap, T_truth_map: SE2) -> Row:
-        """Score one map."""
+    def draw(self, tracks: Tracks) -> OccupancyMap:
+        """All pings in one map."""
+        drawn = draw_chart(list(tracks.values()), self.occupancy, LOG_ODDS_MAX)
+        if drawn is None:
+            raise DataError(f"seed {self.mission.config.seed}: no ping was kept")
+        return drawn
+
+    def row(self, stage: str, drawn: OccupancyMap, placed: TrajectoryError | None = None) -> Row:
+        """Score one map, placed as the trajectories are that it was drawn along; None: true."""
+        T_truth_map = SE2() if placed is None else placed.T_truth_map
         error = compare_maps(drawn, self.truth_map, T_truth_map, tolerance_m=WALL_TOLERANCE_M)
+        config, outcome = self.mission.config, self.outcome
         return {
+            "mission": f"{config.place}, seed {config.seed}",
+            "merged": f"{outcome.num_merged_vehicles} of {len(outcome.vehicles)}",
             "stage": stage,
             "thickness [cells]": map_sharpness(drawn).wall_thickness_cells,
             "IoU 0.25 m": error.wall_iou_tolerant,
@@ -129,10 +165,12 @@ class _Mapped:
             "recall": error.wall_recall,
             "MSE": error.mse,
             "SSIM": error.ssim,
+            "trajectory [m]": 0.0 if placed is None else placed.rmse_m,
         }
 
 
-def _map_mission(config: MissionConfig, work: Path) -> _Mapped:
+def map_mission(config: MissionConfig, work: Path) -> MappedMission:
+    """Simulate a mission, map its vehicles, and merge them."""
     recorded = simulate_mission(work / "mission", config, num_processes=num_processors())
     recordings, _ = find_recordings(recorded.bags, lambda _: SensorConfig(), {})
     settings = OfflineConfig.read(None, [r.vehicle_id for r in recordings])
@@ -142,61 +180,62 @@ def _map_mission(config: MissionConfig, work: Path) -> _Mapped:
         for submap in made.submaps:
             queue.add_submap(submap)
     settle(queue, settings.registration)
-    summed = outcome_of(queue)
-    pings = {key: own for made in mapped for key, own in made.pings.items()}
-    occupancy = settings.mapper[mapped[0].vehicle_id].occupancy
-    if summed.global_map is None:
-        raise DataError(f"seed {config.seed}: nothing was mapped")
-    graph, tracks = chart_tracks(summed, pings)
-    chart = charted(summed, pings, occupancy)
-    truth = {path.stem: read_tum(path) for path in recorded.truth_trajectories}
-    return _Mapped(
+    return MappedMission(
         plan_mission(config),
-        summed.global_map,
-        graph,
-        tracks,
+        outcome_of(queue),
+        {key: own for made in mapped for key, own in made.pings.items()},
         read_map(recorded.truth_map),
-        trajectory_error(summed.trajectories(), truth).T_truth_map,
-        trajectory_error(chart.trajectories(), truth).T_truth_map,
-        occupancy,
+        {path.stem: read_tum(path) for path in recorded.truth_trajectories},
+        settings.mapper[mapped[0].vehicle_id].occupancy,
     )
 
 
-def _stages(config: MissionConfig, work: Path) -> Iterator[Row]:
-    mapped = _map_mission(config, work)
-    T_graph, T_chart = mapped.T_truth_graph, mapped.T_truth_map
-    true, found = _true_poses(mapped), dict(mapped.tracks)
+def stages(mapped: MappedMission) -> Iterator[Row]:
+    """Rows of the maps that a mission gives, each stage of drawing replaced by its ideal."""
+    if mapped.outcome.global_map is None:
+        raise DataError(f"seed {mapped.mission.config.seed}: nothing was mapped")
+    graph, found = chart_tracks(mapped.outcome, mapped.pings)
+    chart, in_chart = _charted(mapped, mapped.pings)
+    in_graph = trajectory_error(mapped.outcome.trajectories(), mapped.truth)
+    draw, row = mapped.draw, mapped.row
+    yield row(_LIVE, mapped.outcome.global_map, in_graph)
+    yield row("last pass, poses of the graph", draw(graph), in_graph)
+    yield row(_CHART, chart, in_chart)
+    scales = {run.vehicle_id: 1.0 / run.range_scale for run in mapped.mission.runs}
+    tuned = {
+        key: [_scaled_ping(ping, scales[key.track.vehicle_id]) for ping in own]
+        for key, own in mapped.pings.items()
+    }
+    yield row("the same, had the speed of sound been known", *_charted(mapped, tuned))
+    yield row("with true poses", draw(_true_poses(mapped, found)))
     calibrated = {
         name: _scaled(track, 1.0 / mapped.run_of(name).range_scale)
-        for name, track in _true_poses(mapped, is_mounting_known=True).items()
+        for name, track in _true_poses(mapped, found, is_mounting_known=True).items()
     }
-    echoes = _with_true_echoes(mapped, found)
+    yield row("... also true mounting and speed of sound", draw(calibrated))
+    yield row("chart with true echoes", draw(_with_true_echoes(mapped, found)), in_chart)
     narrow = {name: _narrowed(track) for name, track in found.items()}
+    yield row("chart with beams a tenth as wide", draw(narrow), in_chart)
+    plain = _plain(found, mapped.occupancy)
+    yield row("chart, an echo marks its own cell alone", plain, in_chart)
+    yield _best_threshold(mapped, "chart, best threshold of drawing", chart, in_chart)
     best = _with_true_echoes(mapped, calibrated)
-    same = SE2()
-
-    def draw(tracks: Tracks) -> OccupancyMap:
-        drawn = draw_chart(list(tracks.values()), mapped.occupancy, LOG_ODDS_MAX)
-        assert drawn is not None
-        return drawn
-
-    yield mapped.row("sum of rigid submaps, as merged live", mapped.summed_map, T_graph)
-    yield mapped.row("last pass, poses of the graph", draw(mapped.graph), T_graph)
-    chart = draw(found)
-    yield mapped.row("last pass, poses refined: offline's chart", chart, T_chart)
-    yield mapped.row("the same with true poses", draw(true), same)
-    yield mapped.row("... also true mounting and speed of sound", draw(calibrated), same)
-    yield mapped.row("chart with true echoes", draw(echoes), T_chart)
-    yield mapped.row("chart with beams a tenth as wide", draw(narrow), T_chart)
-    yield mapped.row("chart, an echo marks its own cell alone", _plain(mapped), T_chart)
-    yield _best_threshold(mapped, "chart, best threshold of drawing", chart)
-    yield mapped.row("all true: poses, mounting, sound, echoes", draw(best), same)
+    yield row("all true: poses, mounting, sound, echoes", draw(best))
 
 
-def _true_poses(mapped: _Mapped, *, is_mounting_known: bool = False) -> Tracks:
+def _charted(mapped: MappedMission, pings: Pings) -> tuple[OccupancyMap, TrajectoryError]:
+    outcome = charted(mapped.outcome, pings, mapped.occupancy)
+    if outcome.global_map is None:
+        raise DataError(f"seed {mapped.mission.config.seed}: nothing was mapped")
+    return outcome.global_map, trajectory_error(outcome.trajectories(), mapped.truth)
+
+
+def _true_poses(
+    mapped: MappedMission, tracks: Tracks, *, is_mounting_known: bool = False
+) -> Tracks:
     """Where the sonar really was, mounted as the recording says or as it really was."""
     result = {}
-    for name, track in mapped.tracks.items():
+    for name, track in tracks.items():
         run = mapped.run_of(name)
         motion = run.motion.at(track.stamps_ns)
         T_base_sonar = run.T_base_sonar if is_mounting_known else T_BASE_SONAR
@@ -205,7 +244,7 @@ def _true_poses(mapped: _Mapped, *, is_mounting_known: bool = False) -> Tracks:
     return result
 
 
-def _with_true_echoes(mapped: _Mapped, tracks: Tracks) -> Tracks:
+def _with_true_echoes(mapped: MappedMission, tracks: Tracks) -> Tracks:
     """Each echo at the range of the first wall along its beam; those that met none are dropped."""
     world, max_range_m = mapped.mission.world, mapped.mission.config.sonar.max_range_m
     result = {}
@@ -231,12 +270,14 @@ def _with_true_echoes(mapped: _Mapped, tracks: Tracks) -> Tracks:
 
 def _scaled(track: PingTrack, factor: float) -> PingTrack:
     """All ranges times a factor."""
+    return dataclasses.replace(track, pings=[_scaled_ping(p, factor) for p in track.pings])
+
+
+def _scaled_ping(ping: DrawnPing, factor: float) -> DrawnPing:
     scale = np.float32(factor)
-    pings = [
-        dataclasses.replace(p, points=scale * p.points, free_range_m=scale * p.free_range_m)
-        for p in track.pings
-    ]
-    return dataclasses.replace(track, pings=pings)
+    return dataclasses.replace(
+        ping, points=scale * ping.points, free_range_m=scale * ping.free_range_m
+    )
 
 
 def _narrowed(track: PingTrack) -> PingTrack:
@@ -256,11 +297,10 @@ def _narrowed(track: PingTrack) -> PingTrack:
     return dataclasses.replace(track, pings=pings)
 
 
-def _plain(mapped: _Mapped) -> OccupancyMap:
+def _plain(tracks: Tracks, config: OccupancyConfig) -> OccupancyMap:
     """No crests: log-odds of an echo in the one cell where it lies, of water before it."""
-    config = mapped.occupancy
     water, echoes = GrowingGrid(config), []
-    for track in mapped.tracks.values():
+    for track in tracks.values():
         for ping, pose in zip(track.pings, track.T_map_sonar, strict=True):
             seen, T_map_sonar = ping.detections(), SE2.from_array(pose)
             echoes.append(T_map_sonar.apply(seen.points))
@@ -280,13 +320,15 @@ def _plain(mapped: _Mapped) -> OccupancyMap:
     return drawn.to_occupancy(LOG_ODDS_MAX)
 
 
-def _best_threshold(mapped: _Mapped, stage: str, chart: OccupancyMap) -> Row:
+def _best_threshold(
+    mapped: MappedMission, stage: str, chart: OccupancyMap, placed: TrajectoryError
+) -> Row:
     """Of several thresholds above which a cell is a wall, the one that the truth likes best."""
     rows = []
     for percent in _THRESHOLDS_PERCENT:
         values = chart.values.copy()
         values[(values > 50) & (values <= percent)] = 50
         drawn = OccupancyMap(chart.spec, values)
-        rows.append(mapped.row(f"{stage} ({percent} %)", drawn, mapped.T_truth_map))
+        rows.append(mapped.row(f"{stage} ({percent} %)", drawn, placed))
     found = max(rows, key=lambda row: row["IoU 0.25 m"])
     return {**found, "stage": stage}
