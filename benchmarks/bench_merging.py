@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import resource
 import sys
+import tempfile
 import tracemalloc
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from harness import Timing, emit, require, run_cases, timed
@@ -19,6 +21,8 @@ from uw_dslam_ros2.core.grid import FREE, OCCUPIED, UNKNOWN, GridSpec, Occupancy
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.io.maps.files import write_map
+from uw_dslam_ros2.io.maps.provenance import write_provenance
 from uw_dslam_ros2.sim.maps.fleets import Fleet, KnowingMatcher, answer_all, lawnmower_fleet
 
 _MAX_RMSE_M = 0.5  # one cell, for a hundred submaps
@@ -145,8 +149,9 @@ def large(quick: bool) -> None:
             queue.add_submap(submap)
         changed = queue.changed_window()
         held, _ = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
         require(changed is not None, "nothing was drawn")
+        seen_peak, map_peak = _written(queue)
+        tracemalloc.stop()
         records = queue.submaps()
         left_out = [record for record in records if "not drawn" in record.reason]
         emit(
@@ -159,9 +164,28 @@ def large(quick: bool) -> None:
                 "map_cells": math.prod(changed[0].shape) if changed else 0,
                 "grids_mb": sum(r.submap.grid.values.nbytes for r in records) * 1e-6,
                 "held_mb": held * 1e-6,
+                "provenance_peak_mb": seen_peak * 1e-6,
+                "map_peak_mb": map_peak * 1e-6,
             },
         )
         require(bool(left_out) == (arm_m > 1000.0), f"{len(left_out)} left out")
+
+
+def _written(queue: MapQueue) -> list[int]:
+    """Most bytes there were while who saw what, and then the map, was made and written."""
+    peaks = []
+    with tempfile.TemporaryDirectory() as folder:
+        for ask, write in (
+            (queue.provenance, write_provenance),
+            (queue.global_map, write_map),
+        ):
+            tracemalloc.reset_peak()
+            found = ask()
+            require(found is not None, "there is no map")
+            write(Path(folder) / "map", found)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            del found
+    return peaks
 
 
 def _along_an_l(arm_m: float) -> Iterator[Submap]:
