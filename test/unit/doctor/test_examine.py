@@ -1,7 +1,6 @@
 """Each wrong convention is named, with what mends it; nothing is said where nothing is wrong."""
 
 import math
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -126,32 +125,62 @@ def test_nothing_is_said_where_nothing_is_wrong(recording):
     assert found.num_ping_motions > 40
 
 
-def test_a_velocity_along_the_worlds_axes_is_no_mounting(recording):
-    """As a filter's twist in its odom frame, sent as a DVL's."""
+@pytest.mark.parametrize("is_ned", [False, True])
+def test_a_velocity_along_the_worlds_axes_is_turned_back(recording, is_ned):
+    """As a filter's twist in its odom frame, sent as a DVL's; of north and east as well."""
     navigation, pings = recording
     yaw = np.interp(navigation.velocity_s, navigation.imu_s, navigation.yaw_rad)
     cos, sin = np.cos(yaw), np.sin(yaw)
     x, y = navigation.velocity_m_s.T
     in_world = np.column_stack([cos * x - sin * y, sin * x + cos * y])
+    if is_ned:
+        in_world = in_world[:, ::-1]
     found = examine(replace(navigation, velocity_m_s=in_world), pings)
+    assert [f.kind for f in found.findings] == ["dvl_in_world"]
+    changes = found.conventions.changes()
+    assert changes.pop("velocity_axes") == "world"
+    offset = 0.5 * math.pi if is_ned else 0.0
+    assert changes.pop("velocity_yaw_offset_rad") == pytest.approx(offset, abs=0.05)
+    assert changes == ({"velocity_is_mirrored": True} if is_ned else {})
+
+
+def test_without_an_orientation_a_velocity_along_the_worlds_axes_is_only_told(recording):
+    navigation, pings = recording
+    yaw = np.interp(navigation.velocity_s, navigation.imu_s, navigation.yaw_rad)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x, y = navigation.velocity_m_s.T
+    in_world = np.column_stack([cos * x - sin * y, sin * x + cos * y])
+    no_yaw = np.full_like(navigation.yaw_rad, np.nan)
+    found = examine(replace(navigation, velocity_m_s=in_world, yaw_rad=no_yaw), pings)
     assert [f.kind for f in found.findings] == ["dvl_in_world"]
     assert found.conventions.changes() == {}
 
 
 @pytest.mark.parametrize("turn_deg", [-25.0, 20.0])
-def test_a_sonar_that_was_knocked_is_told_with_time_and_angle(turn_deg):
+def test_a_sonar_that_was_knocked_is_turned_from_then_on(turn_deg):
     navigation, pings = vehicle(3, 85.0)
     points = tuple(
         turned(p, -math.radians(turn_deg)) if t > 45.0 else p
         for t, p in zip(pings.stamp_s, pings.points, strict=True)
     )
-    found = examine(navigation, PingSample(pings.stamp_s, points, pings.T_base_sonar))
-    knock = next(f for f in found.findings if f.kind == "sonar_knocked")
-    at_s, degrees = (
-        float(word) for word in re.findall(r"(-?\d+) (?:s into|degrees)", knock.detail)
-    )
-    assert at_s == pytest.approx(45.0, abs=8.0)
-    assert degrees == pytest.approx(turn_deg, abs=4.0)
+    knocked = PingSample(pings.stamp_s, points, pings.T_base_sonar, start_s=1000.0)
+    found = examine(navigation, knocked)
+    assert [f.kind for f in found.findings] == ["sonar_knocked"]
+    changes = found.conventions.changes()
+    assert changes.pop("sonar_knocked_at_s") == pytest.approx(1045.0, abs=3.0)
+    turn_rad = changes.pop("sonar_knocked_yaw_rad")
+    assert math.degrees(turn_rad) == pytest.approx(turn_deg, abs=4.0)
+    assert changes == {}
+
+
+def test_a_dvl_that_was_knocked_is_no_fault_of_the_sonar():
+    navigation, pings = vehicle(3, 85.0)
+    velocity = navigation.velocity_m_s.copy()
+    is_after = navigation.velocity_s > 45.0
+    velocity[is_after] = turned(velocity[is_after], math.radians(-20.0))
+    found = examine(replace(navigation, velocity_m_s=velocity), pings)
+    assert [f.kind for f in found.findings] == ["dvl_knocked"]
+    assert found.conventions.changes() == {}
 
 
 @pytest.mark.parametrize("tilt_deg", [2.0, 15.0])

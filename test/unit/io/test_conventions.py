@@ -8,7 +8,7 @@ import pytest
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import SonarImage
-from uw_dslam_ros2.io.conventions import correct, correct_mounting
+from uw_dslam_ros2.io.conventions import CorrectedMountings, correct
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
     ImageEvent,
@@ -114,9 +114,35 @@ def test_mountings_turn_as_seen_from_above_whatever_the_instruments_axes():
     conventions = Conventions(velocity_yaw_offset_rad=0.5 * math.pi)
     downward = np.diag([1.0, -1.0, -1.0, 1.0])
     for mounting in (np.eye(4), downward):
-        turned = correct_mounting(velocity(1.0, 0.0), mounting, conventions)
+        turned = CorrectedMountings(conventions).of(velocity(1.0, 0.0), mounting)
         np.testing.assert_allclose(turned[:3, :3] @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
-    assert correct_mounting(image(), downward, conventions) is downward
+    assert CorrectedMountings(conventions).of(image(), downward) is downward
     mirrored = Conventions(velocity_is_mirrored=True, velocity_yaw_offset_rad=0.5 * math.pi)
-    turned = correct_mounting(velocity(1.0, 2.0), np.eye(4), mirrored)
+    turned = CorrectedMountings(mirrored).of(velocity(1.0, 2.0), np.eye(4))
     np.testing.assert_allclose(turned[:3, :3] @ [1.0, 2.0, 0.0], [2.0, 1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 70.0, -150.0])
+@pytest.mark.parametrize("is_ned", [False, True])
+def test_velocities_along_the_worlds_axes_are_turned_back_by_the_heading(yaw_deg, is_ned):
+    yaw = math.radians(yaw_deg)
+    v_world = [math.cos(yaw) - 0.3 * math.sin(yaw), math.sin(yaw) + 0.3 * math.cos(yaw)]
+    changes = {"velocity_axes": "world"}
+    if is_ned:
+        v_world = v_world[::-1]
+        changes |= {"velocity_is_mirrored": True, "velocity_yaw_offset_rad": 0.5 * math.pi}
+    corrected = CorrectedMountings(Conventions(**changes))
+    assert corrected.of(velocity(*v_world), np.eye(4)) is None  # no heading yet
+    corrected.of(
+        ImuEvent(*KEY, np.array([0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)]), None, None),
+        np.eye(4),
+    )
+    turned = corrected.of(velocity(*v_world), np.eye(4))
+    np.testing.assert_allclose(turned[:3, :3] @ [*v_world, 0.0], [1.0, 0.3, 0.0], atol=1e-9)
+
+
+def test_a_sonar_that_was_knocked_is_turned_from_then_on():
+    for at_s, angle in ((99.0, 0.3), (101.0, 0.0)):
+        conventions = Conventions(sonar_knocked_at_s=at_s, sonar_knocked_yaw_rad=0.3)
+        turned = CorrectedMountings(conventions).of(image(), np.eye(4))
+        assert math.atan2(turned[1, 0], turned[0, 0]) == pytest.approx(angle)

@@ -38,6 +38,12 @@ class Conventions(Config):
     velocity_is_mirrored: bool = setting(
         False, doc="the velocity's sideways axis has the wrong sign; set right before it is turned"
     )
+    velocity_axes: str = setting(
+        "vehicle",
+        choices=("vehicle", "world"),
+        doc="axes of the velocity: the vehicle's, or the world's, which do not turn with it; then "
+        "the IMU's heading turns it back, and velocity_yaw_offset_rad says how they lie to it",
+    )
     velocity_scale: float = setting(1.0, 1e-4, 1e4, "factor on the measured velocity")
     velocity_zero_is_invalid: bool = setting(
         False, doc="a velocity of exactly zero means that there was none (no bottom lock)"
@@ -54,6 +60,12 @@ class Conventions(Config):
     sonar_is_mirrored: bool = setting(False, doc="port and starboard of the sonar are exchanged")
     sonar_yaw_offset_rad: float = setting(
         0.0, -3.2, 3.2, "turns the echoes about the sonar, counter-clockwise seen from above [rad]"
+    )
+    sonar_knocked_at_s: float = setting(
+        0.0, 0.0, 1e11, "stamp from which on the sonar sits turned on its mounting [s]; 0: never"
+    )
+    sonar_knocked_yaw_rad: float = setting(
+        0.0, -3.2, 3.2, "by how much it is turned then, counter-clockwise seen from above [rad]"
     )
     sonar_range_scale: float = setting(1.0, 0.1, 10.0, "factor on the ranges (sound speed)")
     sonar_delay_s: float = setting(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.conventions import Conventions
+from uw_dslam_ros2.core.mounting import rotation_of_quaternion
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.readings import (
     BeamsEvent,
@@ -22,7 +23,7 @@ from uw_dslam_ros2.io.readings import (
     VelocityEvent,
 )
 
-__all__ = ["correct", "correct_mounting"]
+__all__ = ["CorrectedMountings", "correct"]
 
 FloatArray = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ _Ping = ImageEvent | ScanEvent | PointsEvent | BeamsEvent
 def correct[EventT: Event](event: EventT, conventions: Conventions) -> EventT | None:
     """What a reading says in the usual conventions; None where it says nothing then.
 
-    All but the angles of mounting, which `correct_mounting` takes.
+    All but the angles of mounting, which `CorrectedMountings` takes.
     """
     result: Event | None = event
     if isinstance(event, ImuEvent):
@@ -52,26 +53,55 @@ def correct[EventT: Event](event: EventT, conventions: Conventions) -> EventT | 
     return cast("EventT | None", result)
 
 
-def correct_mounting(
-    event: Event, T_base_sensor: FloatArray, conventions: Conventions
-) -> FloatArray:
-    """``T_base_sensor`` (4, 4) with the instrument turned as the conventions say.
+class CorrectedMountings:
+    """Mountings of the instruments of one vehicle, as its conventions say.
 
-    A mirrored velocity makes it a reflection: its forward and left become those of the body.
+    Readings are shown in the order of their stamps: velocities along the world's axes are turned
+    by the last heading.
     """
-    yaw_rad, side = 0.0, 1.0
-    if isinstance(event, VelocityEvent):
-        yaw_rad = conventions.velocity_yaw_offset_rad
-        side = -1.0 if conventions.velocity_is_mirrored else 1.0
-    elif isinstance(event, _Ping):
-        yaw_rad = conventions.sonar_yaw_offset_rad
-    if yaw_rad == 0.0 and side == 1.0:
-        return T_base_sensor
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    turn = np.array([[cos, -sin * side, 0.0], [sin, cos * side, 0.0], [0.0, 0.0, 1.0]])
-    turned = T_base_sensor.copy()
-    turned[:3, :3] = turn @ T_base_sensor[:3, :3]
-    return turned
+
+    def __init__(self, conventions: Conventions) -> None:
+        self._conventions = conventions
+        self._yaw_rad = self._yaw_rate_rad_s = 0.0
+        self._yaw_ns: int | None = None
+
+    def of(self, event: Event, T_base_sensor: FloatArray) -> FloatArray | None:
+        """``T_base_sensor`` (4, 4) with the instrument turned; None: it cannot be used yet.
+
+        A mirrored velocity makes it a reflection: its forward and left become those of the body.
+        """
+        conventions = self._conventions
+        if isinstance(event, ImuEvent):
+            self._note_heading(event, T_base_sensor[:3, :3])
+        yaw_rad, side = 0.0, 1.0
+        if isinstance(event, VelocityEvent):
+            yaw_rad = conventions.velocity_yaw_offset_rad
+            side = -1.0 if conventions.velocity_is_mirrored else 1.0
+            if conventions.velocity_axes == "world":
+                if self._yaw_ns is None:
+                    return None
+                since_s = (event.stamp_ns - self._yaw_ns) * 1e-9
+                yaw_rad -= self._yaw_rad + since_s * self._yaw_rate_rad_s
+        elif isinstance(event, _Ping):
+            yaw_rad = conventions.sonar_yaw_offset_rad
+            if 0.0 < conventions.sonar_knocked_at_s <= event.stamp_ns * 1e-9:
+                yaw_rad += conventions.sonar_knocked_yaw_rad
+        if yaw_rad == 0.0 and side == 1.0:
+            return T_base_sensor
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        turn = np.array([[cos, -sin * side, 0.0], [sin, cos * side, 0.0], [0.0, 0.0, 1.0]])
+        turned = T_base_sensor.copy()
+        turned[:3, :3] = turn @ T_base_sensor[:3, :3]
+        return turned
+
+    def _note_heading(self, event: ImuEvent, R_base_imu: FloatArray) -> None:
+        if event.orientation_xyzw is None:
+            return
+        R_world_base = rotation_of_quaternion(event.orientation_xyzw) @ R_base_imu.T
+        self._yaw_rad = math.atan2(R_world_base[1, 0], R_world_base[0, 0])
+        rates = event.angular_velocity_rad_s
+        self._yaw_rate_rad_s = 0.0 if rates is None else float((R_base_imu @ rates)[2])
+        self._yaw_ns = event.stamp_ns
 
 
 def _earlier(stamp_ns: int, delay_s: float) -> int:

@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.doctor.turning.verdict import choose_spans, examine_turn
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.sonar import SonarConfig
-from uw_dslam_ros2.io.conventions import correct_mounting
+from uw_dslam_ros2.io.conventions import CorrectedMountings
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.feeding import feed
 from uw_dslam_ros2.io.readings import (
@@ -84,11 +84,14 @@ def examine_readings(
 
     def collect(is_wanted: IsWanted) -> None:
         nonlocal is_axis_open
+        corrected = CorrectedMountings(conventions)
         for event in source(is_wanted):
             if isinstance(event, TruthEvent | TransformEvent):
                 continue
             try:
-                mounting = correct_mounting(event, mounting_of(event), conventions)
+                mounting = corrected.of(event, mounting_of(event))
+                if mounting is None:
+                    continue
                 is_axis_open |= _is_axis_open(event, mounting)
                 feed(collector, event, mounting)  # type: ignore[arg-type]  # has a mapper's inputs
                 if isinstance(event, PoseEvent):

@@ -26,7 +26,7 @@ from uw_dslam_ros2.core.registration.grids.register import GridRegistrationConfi
 from uw_dslam_ros2.core.registration.result import RegistrationResult
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.bags import ImuEvent, TransformEvent, TruthEvent
-from uw_dslam_ros2.io.conventions import correct_mounting
+from uw_dslam_ros2.io.conventions import CorrectedMountings
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.examining import examine_recording, mended
 from uw_dslam_ros2.io.feeding import feed_runs, in_stamp_order
@@ -185,6 +185,7 @@ def map_recording(
         reader.conventions, sonar, said = mended(examined, sensors.conventions, config.sonar)
         findings += said
         config = dataclasses.replace(config, sonar=sonar)
+        corrected = CorrectedMountings(reader.conventions)
         runs = VehicleRuns(config, recording.vehicle_id, lambda: next(run_ids), kept)
         for number, event in enumerate(in_stamp_order(reader.events()), start=1):
             if number % 200 == 0:
@@ -202,7 +203,9 @@ def map_recording(
                 has_yaw |= event.yaw_rad is not None
                 has_yaw_rate |= event.yaw_rate_rad_s is not None
             try:
-                mounting = correct_mounting(event, mountings.of(event), reader.conventions)
+                mounting = corrected.of(event, mountings.of(event))
+                if mounting is None:
+                    continue
                 submaps = feed_runs(runs, event, mounting)
             except InvalidInputError as error:
                 raise DataError(f"{recording.vehicle_id}: {role_of(event)}: {error}") from error

@@ -204,6 +204,7 @@ class SampleCollector:
             self._sonar.intensity,
             decibels_per_count(self._levels),
             self._tilt_rad,
+            self.start_ns * 1e-9,
         )
 
     @property

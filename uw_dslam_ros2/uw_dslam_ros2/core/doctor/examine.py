@@ -85,6 +85,7 @@ class _Reading:
     yaw_sign: int = 1
     is_sonar_mirrored: bool = False
     is_velocity_mirrored: bool = False
+    is_velocity_in_world: bool = False
 
 
 class _Trial:
@@ -106,6 +107,7 @@ class _Trial:
         self._yaw: FloatArray | None = None
         self._delay_s = 0.0
         self._side_confidence = 1.0
+        self._start_s = pings.start_s
 
     def run(self) -> None:
         imu, imu_s = self._imu, self._navigation.imu_s
@@ -137,45 +139,53 @@ class _Trial:
             self._say_delays(find_delays(fits, lambda _: None, SURE, _LIKELY))
             return
         if reading == _Reading():
-            if self._is_velocity_in_world():
-                self._result.is_velocity_judged = True
-                return
-            reading = self._velocity_side(reading)
+            reading = self._velocity_in_world() or self._velocity_side(reading)
         chosen = reading
         delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), SURE, _LIKELY)
         fit = self._fit(chosen, delays.velocity_after_imu_s)
         self._result.is_velocity_judged = fit is not None
-        if fit is not None and fit.is_mirrored:
+        if chosen.is_velocity_in_world:
+            self._say_velocity_in_world(fit)
+        elif fit is not None and fit.is_mirrored:
             self._say_velocity_mirrored(fit)
         self._say_delays(delays)
-        if fit is not None:
+        if fit is None:
+            return
+        if not chosen.is_velocity_in_world:
+            late_s = delays.velocity_after_imu_s
+            before = judge_knock(
+                self._result,
+                self._motions,
+                self._navigation,
+                self._start_s - self._result.conventions.sonar_delay_s,
+                fit,
+                lambda part: self._fit(chosen, late_s, part),
+            )
+            fit = before or fit
             if not fit.is_mirrored:
                 self._judge_offset(fit)
-            judge_scale(self._result, fit, self._tilt_rad)
-            late_s = delays.velocity_after_imu_s
-            judge_knock(
-                self._result, self._motions, fit, lambda part: self._fit(chosen, late_s, part)
-            )
+        judge_scale(self._result, fit, self._tilt_rad)
 
     def _fit(
         self,
         reading: _Reading,
         velocity_delay_s: float = 0.0,
         motions: PingMotions | None = None,
-        *,
-        is_velocity_in_world: bool = False,
     ) -> VelocityFit | None:
-        assert self._yaw is not None
+        yaw = self._yaw
+        if reading.is_velocity_in_world and self._imu.by_orientation is not None:
+            yaw = self._imu.by_orientation  # it is this that turns the velocity back
+        assert yaw is not None
         return fit_velocity(
             self._motions if motions is None else motions,
             self._navigation,
-            reading.yaw_sign * self._yaw,
+            reading.yaw_sign * yaw,
             self._delay_s,
             sonar=complex(self._mount.x, self._mount.y),
             sonar_yaw_rad=self._mount.yaw,
             is_sonar_mirrored=reading.is_sonar_mirrored,
             is_velocity_mirrored=reading.is_velocity_mirrored,
-            is_velocity_in_world=is_velocity_in_world,
+            is_velocity_in_world=reading.is_velocity_in_world,
             velocity_delay_s=velocity_delay_s,
         )
 
@@ -327,24 +337,45 @@ class _Trial:
                 velocity_yaw_offset_rad=round(offset, 4),
             )
 
-    def _is_velocity_in_world(self) -> bool:
-        """Say so where the velocity fits only along axes that do not turn with the vehicle."""
+    def _velocity_in_world(self) -> _Reading | None:
+        """The reading along axes that do not turn with the vehicle, where only that fits."""
         plain = self._fit(_Reading())
-        world = self._fit(_Reading(), is_velocity_in_world=True)
-        if plain is None or world is None or abs(math.log(world.scale)) > _UNIT_LOG:
-            return False
-        sure = confidence_of(world, plain)
-        if sure <= SURE or np.nanmean(world.cost) > _MAX_WAY_COST:
-            return False
+        readings = [
+            _Reading(is_velocity_mirrored=side, is_velocity_in_world=True)
+            for side in (False, True)
+        ]
+        fits = [(reading, fit) for reading in readings if (fit := self._fit(reading)) is not None]
+        if plain is None or not fits:
+            return None
+        reading, world = min(fits, key=lambda item: float(np.nansum(item[1].cost)))
+        if abs(math.log(world.scale)) > _UNIT_LOG or np.nanmean(world.cost) > _MAX_WAY_COST:
+            return None
+        self._side_confidence = confidence_of(world, plain)
+        return reading if self._side_confidence > SURE else None
+
+    def _say_velocity_in_world(self, fit: VelocityFit | None) -> None:
+        said = (
+            "its velocity is along axes that do not turn with the vehicle (east and north, or "
+            "those of its odometry), while its message says along its own"
+        )
+        if fit is None or self._imu.by_orientation is None:
+            said += ": have its driver give it in the vehicle's frame"
+            self._result.tell("dvl_in_world", "velocity", said, self._side_confidence)
+            return
+        changes: dict[str, str | float | bool] = {
+            "velocity_axes": "world",
+            "velocity_yaw_offset_rad": round(fit.yaw_rad, 4),
+        }
+        if fit.is_mirrored:
+            changes["velocity_is_mirrored"] = True
+        words = ", ".join(f"conventions.{name}: {value}" for name, value in changes.items())
         self._result.tell(
             "dvl_in_world",
             "velocity",
-            "its velocity is along axes that do not turn with the vehicle (east and north, or "
-            "those of its odometry), while its message says along its own: have its driver give "
-            "it in the vehicle's frame",
-            sure,
+            f"{said} ({words.replace('True', 'true')})",
+            self._side_confidence,
+            **changes,
         )
-        return True
 
     # --- time
     # -------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import Severity
 from uw_dslam_ros2.core.mapping import RunBreak, VehicleMapper, VehicleMapperConfig, VehicleRuns
 from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
-from uw_dslam_ros2.io.conventions import correct, correct_mounting
+from uw_dslam_ros2.io.conventions import CorrectedMountings, correct
 from uw_dslam_ros2.io.drivers import stamp_of
 from uw_dslam_ros2.io.feeding import SensorEvent, feed_runs
 from uw_dslam_ros2.io.mountings import Mountings
@@ -100,6 +100,7 @@ class SonarMapper(ManagedNode):
         self.at_end(self._say_last)
         self._group = MutuallyExclusiveCallbackGroup()
         self._mountings = Mountings(self._base_frame)
+        self._corrected = CorrectedMountings(self._config.conventions)
         self._transforms = Transforms(
             self,
             self._vehicle_id,
@@ -274,7 +275,9 @@ class SonarMapper(ManagedNode):
         T_base_sensor = self._mountings.of(event)
         self._troubles.note_mountings(self._mountings)
         try:
-            mounting = correct_mounting(event, T_base_sensor, self._config.conventions)
+            mounting = self._corrected.of(event, T_base_sensor)
+            if mounting is None:
+                return
             submaps = feed_runs(self._runs, event, mounting)
             self._watch.take(event, mounting)
         except InvalidInputError as error:

@@ -46,7 +46,7 @@ class PingSample:
     recording says that it sits. ``pixels`` is what images hold by their speckle (None: not
     known), ``pixels_read_as`` what they are taken for, ``db_per_count`` a step of decibels.
     ``tilt_rad`` is how far the middle of the fan looks up or down; the points are projected by it
-    already.
+    already. ``start_s`` is the stamp that seconds are counted from.
     """
 
     stamp_s: FloatArray
@@ -56,6 +56,7 @@ class PingSample:
     pixels_read_as: str = "amplitude"
     db_per_count: float = 0.0
     tilt_rad: float = 0.0
+    start_s: float = 0.0
 
     def __post_init__(self) -> None:
         if (np.diff(self.stamp_s) < 0.0).any() or len(self.stamp_s) != len(self.points):
