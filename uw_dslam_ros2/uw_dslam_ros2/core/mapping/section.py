@@ -26,8 +26,8 @@ Watch = Callable[[Detections, SE2], None]
 """Called with all that enters a grid, and its ``T_submap_sonar``."""
 
 _LEAST_BLIND_S = 8.0
-"""All of a vehicle that never has a velocity is uncertain at once, and submaps of a few pings join
-nothing. Where a velocity is lost for a while, they hang together through what is known."""
+"""All of a vehicle that has had no velocity for so long is uncertain at once, and submaps of a few
+pings join nothing. Where one is lost for less, they hang together through what is known."""
 _MIN_MOTION_M, _MIN_TURN_RAD, _MIN_INTERVAL_S = 0.1, 0.02, 1.0
 """A ping enters the grid after this path length, turn or time, whichever comes first: pings of
 one place repeat one another's errors, and a vehicle at rest would be ever more sure of them.
@@ -163,12 +163,13 @@ class OpenSection:
             self._points.append(T_submap_sonar.apply(points))
             self._weight.append(weight)
 
-    def should_close(self, stamp_ns: int, sigma_m: float, is_blind: bool) -> bool:
-        """Whether it has become long, old or uncertain enough; blind: never with a velocity."""
+    def should_close(self, stamp_ns: int, sigma_m: float, silence_s: float) -> bool:
+        """Whether it has become long, old or uncertain enough, `silence_s` after a velocity."""
         config: SubmapConfig = self._config.submap
         if self.num_pings < config.min_pings:
             return False
         age_s = (stamp_ns - self._stamps_ns[0]) * 1e-9
+        is_blind = silence_s > _LEAST_BLIND_S
         return (
             self._length_m >= config.max_length_m
             or age_s >= config.max_duration_s

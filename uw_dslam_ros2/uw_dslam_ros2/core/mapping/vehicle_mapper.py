@@ -308,7 +308,7 @@ class VehicleMapper(VehicleNavigation):
         # At the submap's own start the covariance is zero, which may come out as a trace below it.
         sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
         assert submaps.growing is not None
-        if submaps.growing.should_close(stamp_ns, sigma_m, self._velocity_ns is None):
+        if submaps.growing.should_close(stamp_ns, sigma_m, self.velocity_silence_s(stamp_ns)):
             issued = submaps.close(covariance)
             submaps.go_on(T_submap_base, covariance)
             self._keys.rebase(T_submap_base.inverse())

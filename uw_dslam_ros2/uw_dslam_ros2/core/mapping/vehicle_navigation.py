@@ -117,6 +117,12 @@ class VehicleNavigation:
         """Depth below the surface as last measured; NaN where it is not."""
         return self._depth_m
 
+    def velocity_silence_s(self, stamp_ns: int) -> float:
+        """For how long there has been no velocity [s]; infinity before the first."""
+        if self._velocity_ns is None:
+            return math.inf
+        return max(0.0, (stamp_ns - self._velocity_ns) * 1e-9)
+
     def attitude_at(self, stamp_ns: int) -> FloatArray | None:
         """Roll and pitch (3, 3) as last measured; None where that is not known or long ago."""
         measured_ns, R_level_base = self._attitude
