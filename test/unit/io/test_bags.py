@@ -1,4 +1,5 @@
 import math
+import re
 import shutil
 import sqlite3
 
@@ -148,6 +149,40 @@ def test_folder_without_metadata(tmp_path, storage):
     assert [type(event) for event in read_events(bag)] == whole
     with open_bag(bag) as reader:
         assert reader.damage == ""
+
+
+def emptied(bag):
+    (bag / "metadata.yaml").write_text("")
+
+
+def without_storage_identifier(bag):
+    """As reindexing leaves it."""
+    path = bag / "metadata.yaml"
+    path.write_text(re.sub("storage_identifier: .*", 'storage_identifier: ""', path.read_text()))
+
+
+def renamed(bag):
+    storage_file(bag).rename(bag / "other_0.mcap")
+
+
+@pytest.mark.parametrize("spoil", [emptied, without_storage_identifier, renamed])
+def test_metadata_that_does_not_fit_its_folder_does_no_harm(tmp_path, spoil):
+    bag = write_bag(tmp_path / "bag")
+    expected = len(list(read_events(bag)))
+    spoil(bag)
+    assert len(list(read_events(bag))) == expected
+
+
+@pytest.mark.parametrize("has_metadata", [True, False])
+def test_a_database_of_before_foxy_is_read(tmp_path, has_metadata):
+    """Its topics have no column of QoS profiles."""
+    bag = write_bag(tmp_path / "bag", "sqlite3")
+    expected = len(list(read_events(bag)))
+    with sqlite3.connect(storage_file(bag)) as database:
+        database.execute("alter table topics drop column offered_qos_profiles")
+    if not has_metadata:
+        (bag / "metadata.yaml").unlink()
+    assert len(list(read_events(bag))) == expected
 
 
 def test_a_split_recording_is_read_in_order(tmp_path):
