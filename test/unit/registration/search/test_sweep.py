@@ -22,7 +22,7 @@ from uw_dslam_ros2.core.registration.search.field import (
     mixture_field,
 )
 from uw_dslam_ros2.core.registration.search.sweep import Sweep
-from uw_dslam_ros2.core.registration.search.sweep_kernels import SIDE
+from uw_dslam_ros2.core.registration.search.tile_kernels import SIDE
 from uw_dslam_ros2.core.se2 import SE2
 
 pytestmark = pytest.mark.kernels

@@ -51,7 +51,7 @@ from uw_dslam_ros2.core.registration.search.outcome import SearchOutcome, Search
 from uw_dslam_ros2.core.registration.search.problem import Problem, Term, as_points
 from uw_dslam_ros2.core.registration.search.rivals import Neighborhoods
 from uw_dslam_ros2.core.registration.search.sweep import Sweep
-from uw_dslam_ros2.core.registration.search.sweep_kernels import SIDE
+from uw_dslam_ros2.core.registration.search.tile_kernels import SIDE
 from uw_dslam_ros2.core.se2 import SE2
 
 __all__ = [

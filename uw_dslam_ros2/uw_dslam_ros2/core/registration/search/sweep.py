@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.registration.search import sweep_kernels
+from uw_dslam_ros2.core.registration.search import sweep_kernels, tile_kernels
 from uw_dslam_ros2.core.registration.search.field import Field
 from uw_dslam_ros2.core.registration.search.problem import Problem, Term
-from uw_dslam_ros2.core.registration.search.sweep_kernels import SIDE
+from uw_dslam_ros2.core.registration.search.tile_kernels import SIDE
 
 __all__ = ["Sweep"]
 
@@ -136,7 +136,7 @@ class Sweep:
                 return False
             for add in adders:
                 add(tiles[begin:end], sums[begin:end])
-        sweep_kernels.close_tiles(tiles, parents, self._sums, floor, *level.shape, sums)
+        tile_kernels.close_tiles(tiles, parents, self._sums, floor, *level.shape, sums)
         self._at += 1
         self._tiles, self._sums = tiles, sums
         self.num_tiles += len(tiles)
@@ -154,7 +154,7 @@ class Sweep:
     def highest(self, count: int) -> FloatArray:
         """Boxes (K, 6) with the highest bounds, one of a tile, highest first."""
         tiles, cells = np.empty((2, count), np.int64)
-        num = sweep_kernels.find_highest(self._sums, tiles, cells)
+        num = tile_kernels.find_highest(self._sums, tiles, cells)
         return self._boxes(tiles[:num], cells[:num])
 
     def boxes(self, floor: float) -> tuple[FloatArray, FloatArray]:
@@ -188,7 +188,7 @@ class Sweep:
         turns = level.num_slabs // self._levels[self._at].num_slabs
         children = np.empty((4 * turns * len(self._tiles), 3), np.int64)
         parents = np.empty(len(children), np.int64)
-        count = sweep_kernels.split_tiles(self._tiles, self._sums, floor, turns, children, parents)
+        count = tile_kernels.split_tiles(self._tiles, self._sums, floor, turns, children, parents)
         return children[:count], parents[:count]
 
     def _costs(self, tiles: IntArray, level: _Level) -> FloatArray:
