@@ -82,7 +82,7 @@ class View(Node):
         )
         self._loop = asyncio.new_event_loop()
         self._threads = [
-            threading.Thread(target=self._loop.run_forever, name="pages", daemon=True),
+            threading.Thread(target=self._serve, name="pages", daemon=True),
             threading.Thread(target=self._follow, name="follow", daemon=True),
         ]
         self._threads[0].start()
@@ -152,6 +152,14 @@ class View(Node):
         self._is_new.set()
         asyncio.run_coroutine_threadsafe(self._server.stop(), self._loop).result(1.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
+        self._threads[0].join(1.0)
+
+    def _serve(self) -> None:
+        """Answer browsers until told to stop."""
+        try:
+            self._loop.run_forever()
+        finally:
+            self._loop.close()
 
     def _client(self, service_type: Any, name: str, group: ReentrantCallbackGroup) -> Any:
         return self.create_client(service_type, name, qos_profile=SERVICES, callback_group=group)
