@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.motions.fits import VelocityFit, confidence_of_lead
+from uw_dslam_ros2.core.doctor.motions.fits import SURE, VelocityFit, confidence_of_lead
 from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions
 from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
 
@@ -94,6 +94,8 @@ def judge_knock(
         reach_s = share * step_s
         best = best_of(best.at_s + np.linspace(-reach_s, reach_s, 17)) or best
     confidence = confidence_of_lead(_total(whole) - best.cost, whole.repeats)
+    if confidence <= SURE:
+        return None
     degrees = math.degrees(best.turn_rad)
     if _is_velocity_turned(navigation, best):
         result.tell(
