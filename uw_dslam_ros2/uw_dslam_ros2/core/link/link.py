@@ -31,7 +31,13 @@ from uw_dslam_ros2.core.link.held import HeldSubmaps
 from uw_dslam_ros2.core.link.reporting import Reporting, fitted
 from uw_dslam_ros2.core.link.transport.inbox import Inbox
 from uw_dslam_ros2.core.link.transport.outbox import LOSS_LIMIT, Outbox, OutItem
-from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES, Packet, bundled, unbundled
+from uw_dslam_ros2.core.link.transport.packets import (
+    OVERHEAD_BYTES,
+    Packet,
+    bundled,
+    read_framed,
+    unbundled,
+)
 from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED, Relays
 from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState, ReceivedState
 from uw_dslam_ros2.core.submap import Submap, SubmapId
@@ -318,6 +324,7 @@ class AcousticLink:
     def _take_note(self, sender: int, inbox: Inbox, note: bytes) -> None:
         said = read_note(note)
         if isinstance(said, bytes):
+            self._relays.overhear(sender, read_framed(said)[0])
             self._take_found(sender, inbox, inbox.add_whole(said))
         else:
             inbox.expect(said.num_items, said.voids)
