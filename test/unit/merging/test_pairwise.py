@@ -2,10 +2,11 @@
 
 import dataclasses
 
+import numpy as np
 from unit.merging.fleet import three_vehicles
 
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig, SubmapState
-from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all, refuse
+from uw_dslam_ros2.sim.maps.fleets import KnowingMatcher, answer_all, lawnmower_fleet, refuse
 
 FLEET = three_vehicles()
 PAIRWISE = MapQueueConfig(mode="pairwise")
@@ -55,6 +56,17 @@ def test_a_false_match_is_believed_as_the_paper_does():
     answer_all(queue, KnowingMatcher(FLEET, wrong_share=1.0))
     assert {r.component for r in queue.submaps()} == {0}
     assert FLEET.position_rmse_m(queue) > 5.0
+
+
+def test_nobody_is_set_aside_for_what_others_say():
+    """Wrong matches lay maps on water; whoever pins the frame would leave nothing in it."""
+    fleet = lawnmower_fleet(5, 5, 1)
+    queue = MapQueue(MapQueueConfig(mode="pairwise", anchor_vehicle="auv_01"))
+    for number in np.random.default_rng([1, 0]).permutation(5):
+        for submap_id in sorted(i for i in fleet.submaps if i[0] == f"auv_{number + 1:02d}"):
+            queue.add_submap(fleet.submaps[submap_id])
+    answer_all(queue, KnowingMatcher(fleet, 1, wrong_share=0.3))
+    assert {record.state for record in queue.submaps()} == {SubmapState.MERGED}
 
 
 def test_a_withdrawn_vehicle_does_not_stop_the_others():

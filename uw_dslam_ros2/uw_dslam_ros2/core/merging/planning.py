@@ -147,12 +147,12 @@ class Planning:
         self, library: Library, plan: Plan, answers: Mapping[QueryKey, Answer]
     ) -> tuple[Track | None, str]:
         """The run that contradicts the others, by its matches or by its map, and how."""
+        if self._config.mode == "pairwise":  # that keeps the first answer, whatever others say
+            return None, ""
         track = contradicting_track(library, plan.constraints, min(library.submaps))
         if track is not None:
             return track, "which contradicts the others' maps: most of its matches do not hold"
-        contest = None
-        if self._config.mode != "pairwise":  # that keeps the first answer, whatever others say
-            contest = contested_track(library, plan.constraints, answers.values(), plan.components)
+        contest = contested_track(library, plan.constraints, answers.values(), plan.components)
         if contest is not None:
             return contest.track, (
                 f"whose place is contested: accepted matches put it {contest.distance_m:.0f} m "
