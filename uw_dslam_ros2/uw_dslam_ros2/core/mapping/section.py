@@ -25,9 +25,10 @@ FloatArray = NDArray[np.float64]
 Watch = Callable[[Detections, SE2], None]
 """Called with all that enters a grid, and its ``T_submap_sonar``."""
 
-_LEAST_BLIND_S = 8.0
+_BLIND_S, _LEAST_BLIND_S = 60.0, 8.0
 """All of a vehicle that has had no velocity for so long is uncertain at once, and submaps of a few
-pings join nothing. Where one is lost for less, they hang together through what is known."""
+pings join nothing: they last so long at least. Where a velocity is lost for a while, small ones
+hang together through what is known, and bend where a long one could not."""
 _MIN_MOTION_M, _MIN_TURN_RAD, _MIN_INTERVAL_S = 0.1, 0.02, 1.0
 """A ping enters the grid after this path length, turn or time, whichever comes first: pings of
 one place repeat one another's errors, and a vehicle at rest would be ever more sure of them.
@@ -169,7 +170,7 @@ class OpenSection:
         if self.num_pings < config.min_pings:
             return False
         age_s = (stamp_ns - self._stamps_ns[0]) * 1e-9
-        is_blind = silence_s > _LEAST_BLIND_S
+        is_blind = silence_s > _BLIND_S
         return (
             self._length_m >= config.max_length_m
             or age_s >= config.max_duration_s
