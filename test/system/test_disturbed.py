@@ -36,6 +36,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(600)]
 VEHICLES = ("auv_1", "auv_2")
 PATIENCE_S = 120.0
 ASK_AGAIN_S = 5.0
+CELL_M = VehicleMapperConfig().occupancy.resolution_m
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MANY = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 IS_LATCHED = ("/tf_static",)
@@ -241,4 +242,6 @@ def test_restarts_and_bad_messages_leave_the_trajectories_true(fleet, mission, t
     )
     expected = undisturbed(mission)
     assert found.num_poses > 0.7 * expected.num_poses
-    assert found.rmse_m <= 1.2 * expected.rmse_m, (found, expected)
+    # A cell of the map is the least that a bent trajectory would show.
+    allowed_m = max(1.2 * expected.rmse_m, expected.rmse_m + CELL_M)
+    assert found.rmse_m <= allowed_m, (found, expected)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec
@@ -74,7 +75,7 @@ def _archive(header: dict[str, Any], provenance: MapProvenance) -> bytes:
                 kind = {"descr": dtype.str, "fortran_order": False, "shape": shape}
                 np.lib.format.write_array_header_1_0(entry, kind)
                 for part in parts:
-                    entry.write(part.tobytes())
+                    entry.write(np.ascontiguousarray(part).data)
     return content.getvalue()
 
 
@@ -125,8 +126,11 @@ def _picture_parts(provenance: MapProvenance) -> Iterator[bytes]:
     disputed, owners = (
         cells.strips(is_downward=True) for cells in (provenance.contradictions, provenance.owners)
     )
-    strips = (
-        np.where(owner == 0, len(colors) - 1, np.minimum(number, len(_DISPUTED))).astype(np.uint8)
-        for number, owner in zip(disputed, owners, strict=True)
-    )
-    return png_parts(provenance.spec.shape, strips, colors)
+
+    def strips() -> Iterator[NDArray[np.uint8]]:
+        for number, owner in zip(disputed, owners, strict=True):
+            color = np.minimum(number, len(_DISPUTED)).astype(np.uint8)
+            color[owner == 0] = len(colors) - 1
+            yield color
+
+    return png_parts(provenance.spec.shape, strips(), colors)
