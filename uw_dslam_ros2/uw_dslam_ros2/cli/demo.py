@@ -188,6 +188,8 @@ def _run(args: argparse.Namespace) -> int:
         link=link,
     )
     scores = write_report(out, outcome, facts, recordings.truth)
+    for note in notes:
+        print(f"[demo] warning: {note}", file=sys.stderr, flush=True)
     _conclude(out, headline(outcome, scores), scores, time.monotonic() - started_s)
     return 0
 
@@ -307,14 +309,16 @@ def _replay(
             steps.begin("replaying", "replaying the bags, as fast as the mappers keep up")
             player = _start_player(children, args.rate, recordings)
             _follow(control, player, children.check)
-            control.finish_mappers(recordings.vehicles, _FINISH_TIMEOUT_S)
+            answers = control.finish_mappers(recordings.vehicles, _FINISH_TIMEOUT_S)
             steps.begin("registering", "waiting for the last registrations")
             control.settle_queue()
             is_settled = _settle(control, steps)
             steps.begin("saving", "saving through the manager's services")
             problem = control.save_map(str(out / "global_map"))
             control.save_session(str(out / SESSION_FOLDER))
-    notes = [f"The manager saved no map: {problem}."] if problem else []
+            notes = control.notes_on(answers)
+    if problem:
+        notes.append(f"The manager saved no map: {problem}.")
     if not is_settled:
         notes.append(
             f"The queue was still registering after {_SETTLE_TIMEOUT_S:.0f} s; "

@@ -133,8 +133,10 @@ class _Run:
         self._begun_s = time.monotonic()
         while any(player.poll() is None for player in players):
             self._look()
-        for index, vehicle in vehicles:
+        answers = [
             self._controls[index].finish_mappers([vehicle], _FINISH_TIMEOUT_S)
+            for index, vehicle in vehicles
+        ]
         end_s = self._look()
         begin("registering", "waiting for the last packets and registrations")
         complete_s, is_settled = self._settle(end_s)
@@ -143,11 +145,9 @@ class _Run:
             folder = mission.session_folder(self._out, vehicle)
             folder.parent.mkdir(parents=True, exist_ok=True)
             self._controls[index].save_session(str(folder))
-        notes = (
-            []
-            if is_settled
-            else ["A queue was still registering, or a link sending, when the demo ended."]
-        )
+        notes = [note for i, _ in vehicles for note in self._controls[i].notes_on(answers[i])]
+        if not is_settled:
+            notes.append("A queue was still registering, or a link sending, when the demo ended.")
         if complete_s is None:
             notes.append("Not every submap had crossed the link when the demo ended.")
         return notes, self._facts(end_s, complete_s)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -131,6 +131,21 @@ class MissionControl:
                 raise DataError(f"{vehicle} could not finish its map: {response.message}")
             answers[vehicle] = response.message
         return answers
+
+    def notes_on(self, answers: Mapping[str, str]) -> list[str]:
+        """What a report has to tell of the mapping; `answers` are those of `finish_mappers`."""
+        notes = []
+        for vehicle, answer in answers.items():
+            submaps = [] if self.status is None else self.status.submaps
+            num_runs = len({s.run_id for s in submaps if s.vehicle_id == vehicle})
+            if num_runs > 1:
+                notes.append(
+                    f"{vehicle} began anew on its way: its map is {num_runs} runs, which only "
+                    "registration joins. The log of its mapper says why."
+                )
+            if not answer.endswith(" 0 bad messages"):
+                notes.append(f"{vehicle}: {answer}. The log of its mapper says which.")
+        return notes
 
     def settle_queue(self, timeout_s: float = 60.0) -> None:
         """Tell the manager that no more submaps are expected."""

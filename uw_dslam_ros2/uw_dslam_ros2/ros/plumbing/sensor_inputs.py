@@ -22,7 +22,8 @@ _PING_QUEUE = 100
 _SENSOR_QUEUE = 5000
 """Other messages kept meanwhile: half a minute of a fast IMU; nearly nothing in memory."""
 
-_MAX_AHEAD_NS = 10_000_000_000
+_MAX_AHEAD_NS = 60_000_000_000
+"""The clock of a replay is as late as the node is busy: more than a player lets a mapper lag."""
 _NAMES = {"velocity": "dvl"}
 _SONARS = {
     "scan": ("scan", "sensor_msgs/msg/LaserScan"),
