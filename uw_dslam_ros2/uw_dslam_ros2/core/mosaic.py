@@ -25,7 +25,7 @@ from uw_dslam_ros2.core.grid import (
     percent_table,
 )
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.core.sparse_cells import SQUARE, SparseCells, Window
+from uw_dslam_ros2.core.sparse_cells import SQUARE, SparseCells, Window, window_of_square
 
 __all__ = ["Drawable", "Mosaic", "fuse_maps"]
 
@@ -183,7 +183,7 @@ class Mosaic:
                 continue
             drawing = _Drawing(self._lattice, held.grid, held.T_frame_map)
             for place in _squares_of(held.window):
-                alone = _Layers(_window_of(place))
+                alone = _Layers(window_of_square(place))
                 if drawing.add_to(alone, 1) is None:
                     continue
                 square, seen = owners[place], alone.observed
@@ -200,7 +200,7 @@ class Mosaic:
         drawing = _Drawing(self._lattice, grid, T_frame_map)
         seen = []
         for place in _squares_of(drawing.window):
-            tile = self._tiles.get(place) or _Layers(_window_of(place))
+            tile = self._tiles.get(place) or _Layers(window_of_square(place))
             window = drawing.add_to(tile, sign)
             if window is not None:
                 seen.append(window)
@@ -219,11 +219,6 @@ def _squares_of(window: Window) -> list[tuple[int, int]]:
     rows = range(window.row_0 // SQUARE, (window.row_1 - 1) // SQUARE + 1)
     cols = range(window.col_0 // SQUARE, (window.col_1 - 1) // SQUARE + 1)
     return list(itertools.product(rows, cols))
-
-
-def _window_of(place: tuple[int, int]) -> Window:
-    row, col = place[0] * SQUARE, place[1] * SQUARE
-    return Window(row, col, row + SQUARE, col + SQUARE)
 
 
 def _packed(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SQUARE", "SparseCells", "Window"]
+__all__ = ["SQUARE", "SparseCells", "Window", "window_of_square"]
 
 SQUARE = 256
 """Cells are kept in squares of so many rows and columns."""
@@ -53,6 +53,12 @@ class Window:
             slice(self.row_0 - inside.row_0, self.row_1 - inside.row_0),
             slice(self.col_0 - inside.col_0, self.col_1 - inside.col_0),
         )
+
+
+def window_of_square(place: tuple[int, int]) -> Window:
+    """Cells of the square in a row and column of squares."""
+    row, col = place[0] * SQUARE, place[1] * SQUARE
+    return Window(row, col, row + SQUARE, col + SQUARE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,10 +106,9 @@ class SparseCells:
             around = Window(row * SQUARE, self.window.col_0, (row + 1) * SQUARE, self.window.col_1)
             strip = around.intersection(self.window)
             values = np.zeros(strip.shape, self.dtype)
-            for (square_row, square_col), square in self.squares.items():
-                if square_row == row:
-                    corner = square_row * SQUARE, square_col * SQUARE
-                    own = Window(*corner, corner[0] + SQUARE, corner[1] + SQUARE)
+            for place, square in self.squares.items():
+                if place[0] == row:
+                    own = window_of_square(place)
                     common = own.intersection(strip)
                     if min(common.shape) > 0:
                         values[common.slices(strip)] = square[common.slices(own)]

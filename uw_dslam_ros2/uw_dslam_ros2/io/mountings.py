@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.core.findings import Finding, Severity
 from uw_dslam_ros2.core.mounting import StaticFrames, fan_tilt
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
@@ -152,7 +152,7 @@ class Mountings:
         word = role_of(event)
         if _is_world(frame_id):
             return None
-        words = set(NAMES_OF_ROLES.get({"sonar": "sonar", "dvl": "velocity"}.get(word, ""), ()))
+        words = set(NAMES_OF_ROLES[_topic_role(word)]) if word in ("sonar", "dvl") else set()
         found = []
         for name in sorted(self._frames.names):
             if words & set(re.split("[^a-z0-9]+", parts_of(name)[-1].lower())):
@@ -171,22 +171,26 @@ class Mountings:
 
     def findings(self, vehicle_id: str) -> list[Finding]:
         """What to tell of frames that are unknown, and of sonars that point up or down."""
-        unknown = [
-            Finding(
+
+        def no_mounting(frame_id: str, word: str, told: str, severity: Severity) -> Finding:
+            return Finding(
                 "no_mounting",
-                "velocity" if word == "dvl" else word,
-                f"{_nowhere(frame_id)}; it is taken to sit at the origin, level and looking ahead",
+                _topic_role(word),
+                f"{_nowhere(frame_id)}; it is taken {told}",
+                severity=severity,
                 vehicle_id=vehicle_id,
             )
+
+        unknown = [
+            no_mounting(frame_id, word, "to sit at the origin, level and looking ahead", "warning")
             for frame_id, word in sorted(self.unknown.items())
         ]
         taken = [
-            Finding(
-                "no_mounting",
-                "velocity" if word == "dvl" else word,
-                f"{_nowhere(frame_id)}; it is taken for {name!r}, the only one named so",
-                severity="warning" if frame_id else "info",
-                vehicle_id=vehicle_id,
+            no_mounting(
+                frame_id,
+                word,
+                f"for {name!r}, the only one named so",
+                "warning" if frame_id else "info",
             )
             for frame_id, (word, name) in sorted(self.taken_for.items())
         ]
@@ -203,6 +207,10 @@ class Mountings:
             for frame_id, tilt_rad in sorted(self.tilted.items())
         ]
         return unknown + taken + tilted
+
+
+def _topic_role(word: str) -> str:
+    return "velocity" if word == "dvl" else word
 
 
 def _nowhere(frame_id: str) -> str:

@@ -5,9 +5,8 @@ that all vehicles share, from the moment on in which each is closed. Merging wor
 sent, at both ends alike, so that whoever has received the same has the same map; the tables show
 when everybody had everything, when the first vehicle could first join another, and what the merged
 map is worth beside one of full grids: with everything, and with what all have a minute (1000
-bit/s), five (nano) or twenty (rate0) after the last ping. Five missions take some ten minutes. For
-comparison the bits that descriptors of 16 bytes and a cloud of 9 kbit for each submap that is
-matched (DRACo-SLAM's budget) would take.
+bit/s), five (nano) or twenty (rate0) after the last ping. For comparison the bits that descriptors
+of 16 bytes and a cloud of 9 kbit for each submap that is matched (DRACo-SLAM's budget) would take.
 """
 
 from __future__ import annotations

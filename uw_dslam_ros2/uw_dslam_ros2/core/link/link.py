@@ -30,7 +30,7 @@ from uw_dslam_ros2.core.link.coding.items import (
 from uw_dslam_ros2.core.link.held import HeldSubmaps
 from uw_dslam_ros2.core.link.reporting import Reporting, fitted
 from uw_dslam_ros2.core.link.transport.inbox import Inbox
-from uw_dslam_ros2.core.link.transport.outbox import LOSS_LIMIT, Outbox, OutItem
+from uw_dslam_ros2.core.link.transport.outbox import Outbox, OutItem
 from uw_dslam_ros2.core.link.transport.packets import (
     OVERHEAD_BYTES,
     Packet,
@@ -226,8 +226,7 @@ class AcousticLink:
     def _relayed(self, peers: list[int]) -> bytes | None:
         """A repair of what somebody else has said, for a turn that would be left empty."""
         epochs = {sender: inbox.epoch for sender, inbox in self._inboxes.items()}
-        loss = min(self.loss, LOSS_LIMIT)
-        return self._relays.next_packet(self._items, epochs, peers, loss, self._key)
+        return self._relays.next_packet(self._items, epochs, peers, self.loss, self._key)
 
     def _counted(self, label: str, packet: bytes) -> bytes:
         self._reporting.sent(is_report=label == "status")

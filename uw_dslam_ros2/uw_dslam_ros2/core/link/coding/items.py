@@ -121,6 +121,16 @@ class PeerReport:
     lacking: tuple[int | None, ...] = ()
     is_cut: bool = False
 
+    def lacking_of(self, number: int, parts: int) -> int | None:
+        """How many fragments of an item of so many parts are missing; None where it says not."""
+        offset = number - self.base
+        if offset < 0:
+            return 0
+        if offset >= len(self.lacking):
+            return None if self.is_cut else parts
+        said = self.lacking[offset]
+        return parts if said is None else min(said, parts)
+
 
 @dataclass(frozen=True, slots=True)
 class Status:

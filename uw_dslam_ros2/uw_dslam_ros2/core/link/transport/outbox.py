@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.link.coding.items import PeerReport, whole_note
 from uw_dslam_ros2.core.link.transport.packets import Packet, bundled, framed, num_parts, part_of
-from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED
+from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED, LOSS_LIMIT, num_repairs
 
-__all__ = ["LOSS_LIMIT", "OutItem", "Outbox"]
+__all__ = ["OutItem", "Outbox"]
 
-LOSS_LIMIT = 0.6
-"""Beyond that, more repair in advance only crowds the others out."""
 _LOSS_MEMORY = 0.8
 _SPARE, _SPARE_LOSS = 1, 0.1  # repairs more, where turns would be left empty and packets get lost
 _LOSS_DOUBT = 5.0  # packets that are taken to have arrived before any report
@@ -61,15 +59,9 @@ class Outbox:
         """Learn what a peer has."""
         expected = arrived = 0
         for item in self.items:
-            offset = item.number - report.base
-            if item.num_sent == 0 or (report.is_cut and offset >= len(report.lacking)):
+            lacking = report.lacking_of(item.number, item.parts)
+            if item.num_sent == 0 or lacking is None:
                 continue
-            if offset < 0:
-                lacking = 0
-            elif offset < len(report.lacking) and (said := report.lacking[offset]) is not None:
-                lacking = min(said, item.parts)
-            else:
-                lacking = item.parts
             before, mark = item.peers.get(peer, (item.parts, 0))
             expected += min(item.num_sent - mark, before)
             arrived += min(item.num_sent - mark, before - lacking)
@@ -173,7 +165,7 @@ class Outbox:
                 continue
             lacking, mark = heard
             if lacking:
-                wanted = math.floor(lacking / (1.0 - min(self.loss, LOSS_LIMIT)) + 0.5)
+                wanted = num_repairs(lacking, self.loss)
                 if self.loss > _SPARE_LOSS:
                     wanted += spare
                 left = max(left, wanted - (item.num_sent - mark))

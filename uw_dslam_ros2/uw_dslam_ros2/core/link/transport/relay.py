@@ -11,14 +11,21 @@ from uw_dslam_ros2.core.link.coding.items import PeerReport
 from uw_dslam_ros2.core.link.transport.erasure import MAX_INDEX
 from uw_dslam_ros2.core.link.transport.packets import Packet, framed, num_parts, part_of
 
-__all__ = ["FIRST_RELAYED", "Relays"]
+__all__ = ["FIRST_RELAYED", "LOSS_LIMIT", "Relays", "num_repairs"]
 
+LOSS_LIMIT = 0.6
+"""Beyond that, more repair in advance only crowds the others out."""
 FIRST_RELAYED = 96
 """Fragments from this index on come from others than who said the item."""
 _APART = 11  # between the first indices of two neighbouring vehicles
 
 Place = tuple[int, int]
 """Of an item: sender and number."""
+
+
+def num_repairs(lacking: int, loss: float) -> int:
+    """How many fragments go out so that those that are lacking arrive, by the share of losses."""
+    return math.floor(lacking / (1.0 - min(loss, LOSS_LIMIT)) + 0.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,8 +95,9 @@ class Relays:
                 if number < heard.report.base:
                     continue
                 data = framed(number, content)
-                left = self._left((sender, number), heard, num_parts(len(data), self._max_bytes))
-                left = math.floor(left / (1.0 - loss) + 0.5) - self._since((sender, number), heard)
+                parts = num_parts(len(data), self._max_bytes)
+                lacking = heard.report.lacking_of(number, parts) or 0
+                left = num_repairs(lacking, loss) - self._since((sender, number), heard)
                 order = (left, number, sender)
                 if left > 0 and (best is None or order < best[0]):
                     best = order, data
@@ -97,13 +105,6 @@ class Relays:
             return None
         (_, number, sender), data = best
         return self._cut((sender, number), data, epochs[sender], key)
-
-    def _left(self, item: Place, heard: _Heard, parts: int) -> int:
-        report, offset = heard.report, item[1] - heard.report.base
-        if offset >= len(report.lacking):
-            return 0 if report.is_cut else parts
-        lacking = report.lacking[offset]
-        return parts if lacking is None else min(lacking, parts)
 
     def _since(self, item: Place, heard: _Heard) -> int:
         return self._gone[item] - heard.marks.get(item[1], 0)
