@@ -362,3 +362,21 @@ def test_a_named_vehicle_pins_the_frame_by_its_first_submap_whichever_comes_firs
     poses = {r.submap.submap_id: r.T_component_submap for r in queue.submaps()}
     assert poses[SubmapId("auv_2", 11, 0)] == SE2()
     assert math.isfinite(fleet.position_rmse_m(queue))
+
+
+def test_a_first_submap_that_comes_after_all_are_joined_pins_the_frame_all_the_same():
+    fleet = fleet_of(2, 3)
+    config = MapQueueConfig(anchor_vehicle="auv_1")
+    first = min(fleet.submaps)
+    straight = filled(fleet.submaps.values(), config)
+    answer_all(straight, KnowingMatcher(fleet))
+    late = filled([s for i, s in fleet.submaps.items() if i != first], config)
+    answer_all(late, KnowingMatcher(fleet))
+    assert len(late.trajectories()) == 2, "joined without it"
+    assert map_bytes(late) != map_bytes(straight)
+    late.add_submap(fleet.submaps[first])
+    answer_all(late, KnowingMatcher(fleet))
+    assert map_bytes(late) == map_bytes(straight)
+    assert late.take_notices() == [
+        f"the global frame is now that of {first}, which came late; it was that of auv_1#10/1"
+    ]

@@ -13,9 +13,7 @@ def queue_of(events, fleet, is_growing):
     queue = MapQueue(MapQueueConfig(anchor_vehicle="auv_1", resolution_m=0.5))
     matcher = KnowingMatcher(fleet)
     queue.is_growing = is_growing
-    # What pins the frame is what comes first; the order of the others must not matter.
-    first = next(event for event in events if event[1].submap_id == ("auv_1", 0, 0))
-    for number, (_, submap) in enumerate([first, *events]):
+    for number, (_, submap) in enumerate(events):
         queue.add_submap(submap)
         if is_growing and number % 5 == 4:
             answer_all(queue, matcher)

@@ -19,7 +19,8 @@ class GlobalFrame:
 
     Of ``anchor_vehicle``'s first submap, else of that vehicle's whose name comes first; among
     several groups of joined vehicles, of the largest group. It moves only while no vehicles are
-    joined in it, or when a person says so.
+    joined in it, or when a person says so; and once more where an earlier submap of the same run
+    comes late, as over a link: else who got them in another order would have another map.
 
     Parameters
     ----------
@@ -70,6 +71,8 @@ class GlobalFrame:
         is_open
             Whether answers are missing: what is joined now may come apart.
         """
+        if self._begin_where_run_does(plan, submaps):
+            return True
         placed = {i for part in plan.components for i in part}
         joined = [part for part in plan.components if len({i.track for i in part}) > 1]
         if self.anchor in placed:
@@ -111,6 +114,21 @@ class GlobalFrame:
             )
         self.is_pinned = False
         self._pin(start, submaps[start])
+        return True
+
+    def _begin_where_run_does(self, plan: Plan, submaps: Mapping[SubmapId, StoredSubmap]) -> bool:
+        """Go over to an earlier submap of the anchor's run that has come late."""
+        anchor = self.anchor
+        own = next((part for part in plan.components if anchor in part), None)
+        if anchor is None or own is None:
+            return False
+        first = min((i for i in submaps if i in own and i.track == anchor.track), default=anchor)
+        if first >= anchor:
+            return False
+        self._notices.append(
+            f"the global frame is now that of {first}, which came late; it was that of {anchor}"
+        )
+        self._pin(first, submaps[first])
         return True
 
     def _pin(self, submap_id: SubmapId, stored: StoredSubmap) -> None:
