@@ -8,7 +8,7 @@ from setuptools import find_packages, setup
 
 NAME = "uw_dslam_ros2"
 # From beside this file: it is run from other folders, too.
-NODES = runpy.run_path(str(Path(__file__).resolve().parent / NAME / "node_names.py"))["NODES"]
+NAMES = runpy.run_path(str(Path(__file__).resolve().parent / NAME / "node_names.py"))
 COMMANDS = (
     "simulate",
     "offline",
@@ -50,7 +50,11 @@ setup(
     entry_points={
         "console_scripts": [
             # The view of a running graph is a command that shows saved results, too.
-            *(f"{node} = {NAME}.ros.start:{node}" for node in NODES if node != "view"),
+            *(
+                f"{node} = {NAME}.ros.start:{node}"
+                for node in NAMES["EXECUTABLES"]
+                if node != "view"
+            ),
             f"view = {NAME}.cli.view:main",
             *(f"{command} = {NAME}.cli.{command}:main" for command in COMMANDS),
         ],

@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped, TwistWithCovarianceStamped
 from node.drives import SPEED_M_S, START_NS, Vehicle, drive, finish, mapper_of
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import Imu, LaserScan
+from sensor_msgs.msg import FluidPressure, Imu, LaserScan
 from tf2_msgs.msg import TFMessage
 from uw_dslam_msgs.srv import GetSubmap
 
@@ -26,6 +26,9 @@ from uw_dslam_ros2.ros.mapper import sensor_silence
 from uw_dslam_ros2.ros.plumbing.qos import STATIC_TF
 
 pytestmark = pytest.mark.ros
+
+_SURFACE_PA, _PA_PER_M = 101_325.0, 1025.0 * 9.80665
+"""Of sea water, by the defaults."""
 
 
 def test_room_becomes_map_submap_odometry_and_frames(ros_context, spinning):
@@ -168,6 +171,33 @@ def test_odometry_does_not_jump_where_the_map_is_corrected(ros_context, spinning
     assert 0.0 < covariance[0, 0] < 1.0
     assert covariance[5, 5] > 0.0
     assert vehicle.odometry[-1].pose.covariance[14] == 1e6  # no depth was measured
+
+
+def test_depth_becomes_the_odometrys_height(ros_context, spinning):
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context)
+    depth_pub = vehicle.node.create_publisher(FluidPressure, "depth", 10)
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        until(depth_pub.get_subscription_count, "the depth's subscription")
+        vehicle.send_mount()
+        msg = FluidPressure(fluid_pressure=_SURFACE_PA + _PA_PER_M * 7.0)
+        msg.header.stamp = stamp_to_msg(START_NS)
+        depth_pub.publish(msg)
+        until(lambda: vehicle.values().get("num_depth") == "1", "the depth")
+        drive(until, vehicle, range(3))
+        until(lambda: vehicle.values().get("num_scan") == "6", "all scans")
+        until(lambda: vehicle.values().get("num_imu") == "30", "all of the IMU")
+        assert finish(until, vehicle).success
+        last_ns = START_NS + 2_900_000_000
+        until(lambda: vehicle.odometry and stamp_of(vehicle.odometry[-1]) == last_ns, "the end")
+        key = ("auv_1/odom", "auv_1/base_link")
+        until(lambda: key in vehicle.frames, "TF")
+    newest = vehicle.odometry[-1].pose
+    assert newest.pose.position.z == pytest.approx(-7.0, abs=0.1)
+    covariance = np.reshape(newest.covariance, (6, 6))
+    assert 0.0 < covariance[2, 2] < 1.0
+    assert np.count_nonzero(covariance[2]) == 1
+    assert vehicle.frames[key].transform.translation.z == newest.pose.position.z
 
 
 def test_where_the_last_pass_moves_the_map_the_frame_goes_along(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from uw_dslam_ros2.node_names import NODES
+from uw_dslam_ros2.node_names import EXECUTABLES
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()
@@ -26,7 +26,7 @@ def _executables() -> set[str]:
         for node in tree.body
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
     }
-    return {*NODES, *ast.literal_eval(values["COMMANDS"])}
+    return {*EXECUTABLES, *ast.literal_eval(values["COMMANDS"])}
 
 
 def test_the_python_example_runs_as_it_stands(capsys) -> None:

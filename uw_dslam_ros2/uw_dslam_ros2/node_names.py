@@ -3,7 +3,7 @@
 Imports nothing: the build reads it before anything is installed.
 """
 
-__all__ = ["NODES"]
+__all__ = ["EXECUTABLES", "NODES"]
 
 NODES = (
     "sonar_mapper",
@@ -14,3 +14,6 @@ NODES = (
     "channel",
     "view",
 )
+
+EXECUTABLES = (*NODES, "container")
+"""What is started as a node: these, and several of them in one process."""

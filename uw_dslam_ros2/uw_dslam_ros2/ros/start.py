@@ -9,12 +9,12 @@ import signal
 from collections.abc import Callable
 from typing import Any
 
-from uw_dslam_ros2.node_names import NODES
+from uw_dslam_ros2.node_names import EXECUTABLES
 
 
 def __getattr__(name: str) -> Callable[[], int]:
     """The command of each node, by its name."""
-    if name not in NODES:
+    if name not in EXECUTABLES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return functools.partial(_run, name)
 

@@ -1,4 +1,4 @@
-"""How every node starts, spins and ends."""
+"""How nodes start, spin and end: each in a process of its own, or several in one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rclpy.utilities import try_shutdown
 from uw_dslam_ros2.core.errors import UwDslamError
 from uw_dslam_ros2.ros.plumbing.heartbeat import Heartbeat
 
-__all__ = ["run_node"]
+__all__ = ["run_node", "run_nodes"]
 
 _LOOK_UP_S = 0.2
 _END_WITHIN_S = 1.7
@@ -46,11 +46,18 @@ def _end_in_time(name: str, is_stopped: threading.Event) -> None:
 
 
 def run_node(name: str, make_node: Callable[[], Node], argv: Sequence[str] | None) -> int:
-    """Spin a node until SIGINT or SIGTERM; return the process's exit code.
+    """Spin a node until SIGINT or SIGTERM; see `run_nodes`."""
+    return run_nodes(name, [make_node], argv)
+
+
+def run_nodes(
+    name: str, make_nodes: Sequence[Callable[[], Node]], argv: Sequence[str] | None
+) -> int:
+    """Spin nodes on one executor until SIGINT or SIGTERM; return the process's exit code.
 
     A node whose callbacks wait says in `num_threads` how many threads it needs, and has a method
-    `stop` that ends their waiting; it has under two seconds for that. A wrong setting or file
-    ends the process with one sentence and code 1, not with a traceback.
+    `stop` that ends their waiting; all have under two seconds for that. A wrong setting or file
+    ends the process with one sentence and code 1, not with a traceback. `name` is for the log.
     """
     # rclpy's own handlers would pull the context away under callbacks that still want to answer.
     rclpy.init(
@@ -64,19 +71,22 @@ def run_node(name: str, make_node: Callable[[], Node], argv: Sequence[str] | Non
     threading.Thread(target=_end_in_time, args=(name, is_stopped), daemon=True).start()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    node: Node | None = None
+    nodes: list[Node] = []
     try:
-        node = make_node()
-        executor = MultiThreadedExecutor(getattr(node, "num_threads", 4))
-        executor.add_node(node)
+        for make_node in make_nodes:
+            nodes.append(make_node())
+        executor = MultiThreadedExecutor(sum(getattr(node, "num_threads", 4) for node in nodes))
+        for node in nodes:
+            executor.add_node(node)
         heartbeat = Heartbeat()
         heartbeat.is_ready()
         while not is_stopped.is_set():
             heartbeat.beat()
             executor.spin_once(timeout_sec=_LOOK_UP_S)
         heartbeat.is_stopping()
-        if hasattr(node, "stop"):
-            node.stop()
+        for node in nodes:
+            if hasattr(node, "stop"):
+                node.stop()
         _let_callbacks_end(executor)
     except ExternalShutdownException:
         pass
@@ -84,7 +94,7 @@ def run_node(name: str, make_node: Callable[[], Node], argv: Sequence[str] | Non
         get_logger(name).fatal(str(error))
         return 1
     finally:
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         try_shutdown()
     return 0
