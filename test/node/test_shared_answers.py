@@ -16,14 +16,17 @@ from uw_dslam_msgs.msg import Decision, MergeStatus
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_msgs.srv import Decide, ListDecisions, RegisterMaps
 
+from uw_dslam_ros2.core.link.coding.answers import decode_answer
+from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.io.sessions.session import save_session
 from uw_dslam_ros2.ros.convert.core_types import submap_to_msg
 from uw_dslam_ros2.ros.convert.registration import registration_to_msg
 from uw_dslam_ros2.ros.nodes.acoustic_link import AcousticLinkNode
 from uw_dslam_ros2.ros.nodes.channel import ChannelNode
 from uw_dslam_ros2.ros.nodes.map_queue_manager import MapQueueManager
 from uw_dslam_ros2.ros.plumbing.qos import ANSWERS, LATCHED, SUBMAPS
-from uw_dslam_ros2.sim.maps.fleets import make_result
+from uw_dslam_ros2.sim.maps.fleets import answer_all, make_result
 
 pytestmark = pytest.mark.ros
 
@@ -141,6 +144,26 @@ def test_vehicles_whose_last_digits_differ_end_with_the_same_bytes(fleet):
         first, second = vehicles
         until(lambda: edges(first) and edges(first) == edges(second), "the same answer")
         until(lambda: first.map_bytes() == second.map_bytes(), "the same map")
+
+
+def test_answers_of_a_session_that_nobody_has_heard_are_told(ros_context, spinning, tmp_path):
+    queue = MapQueue()
+    for name, T in T_ROOM.items():
+        queue.add_submap(room_submap(name, T_room_submap=T))
+    found = make_result(T_ROOM["auv_1"].inverse() @ T_ROOM["auv_2"])
+    answer_all(queue, lambda _: found)
+    save_session(tmp_path / "session", queue)
+    manager = make(
+        MapQueueManager, ros_context, "auv_1", link="auv_1", session=str(tmp_path / "session")
+    )
+    probe, told = rclpy.create_node("probe", context=ros_context), []
+    probe.create_subscription(UInt8MultiArray, "/auv_1/link/answers", told.append, ANSWERS)
+    with spinning(manager, probe) as until:
+        until(lambda: told, "the answer")
+    (_, result), *others = [decode_answer(bytes(msg.data)) for msg in told]
+    assert not others
+    assert result.is_accepted
+    assert result.T_target_source.distance_to(found.T_target_source)[0] < 0.001
 
 
 def test_what_is_no_answer_is_told_and_harms_nothing(fleet):

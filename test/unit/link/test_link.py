@@ -12,9 +12,11 @@ from unit.link.talk import Talk
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.link import AcousticLink, Layer, LinkConfig
+from uw_dslam_ros2.core.link.coding.answers import encode_answer
 from uw_dslam_ros2.core.link.coding.fields import digest_of
 from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.sim.maps.fleets import make_result
 
 
 def own_submap(number, sequence, revision=0, run_id=77, seed=None):
@@ -347,3 +349,36 @@ def test_decisions_come_to_all_before_anything_else_and_once():
 def test_decisions_without_bounds_are_refused(decision):
     with pytest.raises(InvalidInputError, match="expected 1 to 1000"):
         AcousticLink(LinkConfig(number=1), "auv_1").add_decision(decision)
+
+
+def some_answer(x_m):
+    return encode_answer(bytes(6), make_result(SE2(x_m, 0.0, 0.0)))
+
+
+def test_an_answer_that_somebody_has_told_is_not_told_again():
+    talk = Talk(num=3)
+    talk.run(60.0)
+    for link in talk.links.values():
+        link.add_answer(some_answer(1.0))
+    talk.run(300.0)
+    heard = [link.take_answers() for link in talk.links.values()]
+    assert sorted(map(len, heard)) == [0, 1, 1], "one has told it, and once"
+    assert not any(link.num_open(talk.now_s) for link in talk.links.values())
+    for link in talk.links.values():
+        link.add_answer(some_answer(1.0))
+    talk.run(600.0)
+    assert not any(link.take_answers() for link in talk.links.values())
+
+
+def test_the_first_vehicle_tells_its_answers_before_walls_and_the_others_after():
+    talk = Talk(num=2)
+    talk.run(60.0)
+    order = {}
+    for number, link in talk.links.items():
+        talk.add(own_submap(number, 0))
+        link.add_answer(some_answer(number))
+        order[number] = [
+            item.label for item in sorted(link._outbox.items, key=lambda item: item.rank)
+        ]
+    assert order[1] == ["hello", "outline", "coarse", "answers", "fine"]
+    assert order[2] == ["hello", "outline", "coarse", "fine", "answers"]

@@ -47,6 +47,7 @@ __all__ = ["MAX_DECISION_BYTES", "AcousticLink"]
 MAX_DECISION_BYTES = 1000
 
 _OUTLINE_RANK, _CELLS_RANK, _ANSWER_RANK, _MOVED_RANK = 0.0, 1.0, 1.5, 1.8
+_ECHO_RANK = 2.5  # of an answer that somebody else is likely to tell
 _DECISION_RANK = -1.0  # seldom, and somebody waits to see what comes of it
 _LAYER_RANKS = {
     Layer.OUTLINE: _OUTLINE_RANK,
@@ -131,7 +132,12 @@ class AcousticLink:
             Where the bytes are no answer.
         """
         decode_answer(answer)
-        self._tell(bytes([ItemKind.ANSWER]) + answer, _ANSWER_RANK, "answers")
+        content = bytes([ItemKind.ANSWER]) + answer
+        if self._is_told(content):
+            return
+        # All who have searched have the same to say: one begins, and who hears it need not.
+        is_first = self._config.number < min(self._heard_s, default=self._config.number + 1)
+        self._tell(content, _ANSWER_RANK if is_first else _ECHO_RANK, "answers")
 
     def take_answers(self) -> list[bytes]:
         """Answers that have come since the last call."""
@@ -151,7 +157,7 @@ class AcousticLink:
             )
         content = bytes([ItemKind.DECISION]) + decision
         # A manager that begins again tells what it had of others, too.
-        if all(content not in items.values() for items in self._items.values()):
+        if not self._is_told(content):
             self._tell(content, _DECISION_RANK, "decisions")
 
     def take_decisions(self) -> list[bytes]:
@@ -165,6 +171,10 @@ class AcousticLink:
     def name_of(self, sender: int) -> str | None:
         """The vehicle with that number; None while it is not known."""
         return self._held.names.get(sender)
+
+    def _is_told(self, content: bytes) -> bool:
+        """Whether somebody else has said it."""
+        return any(content in items.values() for items in self._items.values())
 
     def _tell(self, content: bytes, rank: float, label: str) -> None:
         if all(item.content != content for item in self._outbox.items):
@@ -358,6 +368,7 @@ class AcousticLink:
         elif kind is ItemKind.ANSWER:
             decode_answer(body.rest)  # else it is refused
             self._heard.setdefault(kind, []).append(body.rest)
+            self._outbox.drop(item)
         elif kind is ItemKind.DECISION:
             self._heard.setdefault(kind, []).append(body.rest)
         else:

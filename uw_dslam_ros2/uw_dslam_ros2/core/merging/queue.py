@@ -5,7 +5,7 @@ from __future__ import annotations
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.drawn.trajectories import Trajectory, trajectories_of
-from uw_dslam_ros2.core.merging.graph.answers import Answer, QueryKey
+from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
 from uw_dslam_ros2.core.merging.graph.components import LoopError
 from uw_dslam_ros2.core.merging.records import constraints_of, records_of
 from uw_dslam_ros2.core.merging.state import QueueState
@@ -172,6 +172,18 @@ class MapQueue(SteeredQueue):
             key=lambda a: (a.query.target.ids, a.query.source.ids, a.query.key),
         )
         return [(answer, answer.query.key in used) for answer in by_question]
+
+    def settled_answers(self) -> list[Answer]:
+        """Answers that the map rests on now that all is asked; none while anything is open."""
+        plan = self._plan()
+        if self.is_growing or plan.wanted or self.num_in_flight:
+            return []
+        return [self._answers[key] for key in sorted(plan.visited) if key in self._answers]
+
+    def maps_of(self, query: Query) -> tuple[OccupancyMap, OccupancyMap]:
+        """Source and target of a question, whose submaps are held."""
+        library = self._now.library()
+        return library.render(query.source), library.render(query.target)
 
     def constraints(self) -> list[Constraint]:
         """All edges of the pose graph with what is left of them after optimisation."""

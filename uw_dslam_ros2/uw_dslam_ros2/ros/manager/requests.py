@@ -103,17 +103,35 @@ class QueueRequests:
         """Ask again what was lost, and ask what there are servers for."""
         for request_id, reason in self._servers.take_lost():
             self._ask_again(request_id, reason)
+        self._tell_settled()
         # What others have answered needs no server.
         num_free = self._servers.num_free() or self._shared.num_worth_a_look()
         if num_free > 0:
             for request in self._owner.queue.next_requests(num_free):
                 self._ask(request)
 
+    def _tell_settled(self) -> None:
+        """Tell the others the answers that the map rests on, once nothing is open."""
+        if self._asked or not self._shared.is_worth_telling:
+            return
+        queue = self._owner.queue
+        answers = queue.settled_answers()
+        if not answers:
+            return
+        for answer in answers:
+            query = answer.query
+            if not self._shared.knows(query.key):  # it is from a session
+                ends = query.source.reference, query.target.reference
+                self._shared.take_up(
+                    answer, queue.maps_of(query), query.prior or self._start_prior(*ends)
+                )
+        self._shared.tell([answer.query.key for answer in answers])
+
     def _ask(self, request: MatchRequest) -> None:
         # A server's own time limit would let a busy machine refuse what a quiet one accepts; the
         # number of boxes decides, and this is for what never ends.
         max_seconds = _SEARCH_SHARE * self._timeout_s
-        prior = request.prior or self._start_prior(request)
+        prior = self._prior(request)
         if (known := self._shared.find(request, prior)) is not None:
             self._take(request, known)
             return
@@ -129,9 +147,13 @@ class QueueRequests:
         else:
             self._owner.queue.cancel_request(request.request_id)
 
-    def _start_prior(self, request: MatchRequest) -> PriorWindow | None:
-        """What the vehicles' start poses say of the maps in a request."""
+    def _prior(self, request: MatchRequest) -> PriorWindow | None:
         ends = request.source_reference, request.target_reference
+        return request.prior or self._start_prior(*ends)
+
+    def _start_prior(self, source: SubmapId, target: SubmapId) -> PriorWindow | None:
+        """What the vehicles' start poses say of the maps of two submaps."""
+        ends = source, target
         places = [(i.vehicle_id, self._owner.queue.T_odom_submap(i)) for i in ends]
         return self._start_poses.window(*places[0], *places[1])
 
@@ -146,8 +168,7 @@ class QueueRequests:
         if response.result == RegisterMaps.Response.DONE:
             try:
                 result = registration_from_msg(response.registration)
-                prior = request.prior or self._start_prior(request)
-                result = self._shared.settle(request, prior, result)
+                result = self._shared.settle(request, self._prior(request), result)
             except InvalidInputError as error:
                 result = _unanswered(f"unusable answer: {error}")
         else:

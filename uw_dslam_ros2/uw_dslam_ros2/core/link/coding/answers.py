@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import math
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
@@ -44,7 +46,23 @@ def question_digest(
     return hasher.digest()
 
 
-def encode_answer(question: bytes, result: RegistrationResult) -> bytes:
+class Judged(Protocol):
+    """What is told of an answer: a `RegistrationResult` has it, and what a queue keeps of one."""
+
+    @property
+    def verdict(self) -> Verdict: ...
+
+    @property
+    def T_target_source(self) -> SE2 | None: ...  # noqa: N802 (notation of motions)
+
+    @property
+    def covariance(self) -> NDArray[np.float64]: ...
+
+    @property
+    def probability(self) -> float: ...
+
+
+def encode_answer(question: bytes, result: Judged) -> bytes:
     """An answer; of one without a pose, or whose numbers are not finite, only the verdict."""
     writer = ByteWriter()
     writer.raw(question)

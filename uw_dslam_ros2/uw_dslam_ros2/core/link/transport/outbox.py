@@ -55,6 +55,12 @@ class Outbox:
         item.is_void = True
         return self.add(content, item.rank, item.label)
 
+    def drop(self, content: bytes) -> None:
+        """What nothing was sent of yet need not be said: somebody else has."""
+        for item in self.items:
+            if item.num_sent == 0 and item.content == content:
+                item.is_void = True
+
     def hear(self, peer: int, report: PeerReport) -> None:
         """Learn what a peer has."""
         expected = arrived = 0

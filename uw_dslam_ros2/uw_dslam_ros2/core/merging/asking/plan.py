@@ -56,6 +56,8 @@ class Plan:
     """The anchor's first, then by smallest submap."""
     georeference: Georeference | str = "there are no fixes"
     """Where the first one lies on earth, or why that is not known."""
+    visited: frozenset[QueryKey] = frozenset()
+    """Questions whose answers it rests on, and those that it waits for."""
 
 
 def make_plan(
@@ -227,7 +229,8 @@ class _Planner:
         if carried:
             solved, components = self._solve([*constraints, *carried])
         wanted = sorted(self._verifier.wanted.values(), key=self._is_joined(solved))
-        return Plan(wanted, solved, self._library.odometry.edges, components)
+        visited = frozenset(self._verifier.visited)
+        return Plan(wanted, solved, self._library.odometry.edges, components, visited=visited)
 
     def _carried(
         self, solved: Sequence[Constraint], components: Sequence[Component]
