@@ -16,6 +16,7 @@ from uw_dslam_msgs.msg import Decision, MergeStatus
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 from uw_dslam_msgs.srv import Decide, ListDecisions, RegisterMaps
 
+from uw_dslam_ros2.cli.running.link_watch import what_is_open
 from uw_dslam_ros2.core.link.coding.answers import decode_answer
 from uw_dslam_ros2.core.merging import MapQueue
 from uw_dslam_ros2.core.se2 import SE2
@@ -98,6 +99,16 @@ class Vehicle:
         return repr((info.resolution, info.width, info.origin)), bytes(self.maps[-1].data)
 
 
+def still_open(vehicles):
+    """What the nodes themselves tell of what is missing."""
+    told = [[v.link._report()[2] for v in vehicles], [v.manager._report()[2] for v in vehicles]]
+    links, managers = (
+        [{name: str(value) for name, value in values.items()} for values in nodes]
+        for nodes in told
+    )
+    return what_is_open(VEHICLES, links, managers)
+
+
 @pytest.fixture
 def fleet(ros_context, spinning):
     """``with fleet((error_m, error_m)) as (until, vehicles)``; None: without a server."""
@@ -144,6 +155,7 @@ def test_vehicles_whose_last_digits_differ_end_with_the_same_bytes(fleet):
         first, second = vehicles
         until(lambda: edges(first) and edges(first) == edges(second), "the same answer")
         until(lambda: first.map_bytes() == second.map_bytes(), "the same map")
+        until(lambda: not still_open(vehicles), "rest")
 
 
 def test_answers_of_a_session_that_nobody_has_heard_are_told(ros_context, spinning, tmp_path):

@@ -21,7 +21,7 @@ def test_each_vehicle_ends_with_the_same_map_of_all(tmp_path):
     )
     notes, link = run_linked(tmp_path, mission, lambda *_: None)
     truth = read_truth(recorded.truth_map.parent)
-    add_maps(link, mission, tmp_path, MapQueueConfig(), truth)
+    notes += add_maps(link, mission, tmp_path, MapQueueConfig(), truth)
     assert notes == []
     assert link["is_same_map"]
     assert link["packets"]["sent"] > 0

@@ -174,7 +174,7 @@ def _run(args: argparse.Namespace) -> int:
     steps.begin("writing the report", "writing maps, pictures and report")
     outcome = outcome_of(load_session(out / SESSION_FOLDER, _queue_config(recordings)))
     if linked is not None:
-        add_maps(link, linked, out, _queue_config(recordings), recordings.truth)
+        notes += add_maps(link, linked, out, _queue_config(recordings), recordings.truth)
     steps.end()
     facts = RunFacts(
         title=recordings.title,

@@ -25,12 +25,13 @@ def add_maps(
     out: Path,
     config: MapQueueConfig,
     truth: Truth,
-) -> None:
+) -> list[str]:
     """Say of each vehicle what its own manager's map is worth, and whether all have the same.
 
-    `link` is what `run_linked` found; vehicles, rmse_m and is_same_map are added to it.
+    `link` is what `run_linked` found; of each vehicle num_vehicles_merged, rmse_m and map_digest
+    are added to it, and is_same_map. Returns a note where they have not.
     """
-    digests = set()
+    digests = {}
     for vehicle in mission.vehicles:
         queue = load_session(mission.session_folder(out, vehicle), config)
         found = {
@@ -40,15 +41,21 @@ def add_maps(
             "num_vehicles_merged": len(queue.trajectories()),
             "rmse_m": trajectory_error(found, truth.trajectories).rmse_m if found else None,
         }
-        digests.add(_digest(queue))
-    link["is_same_map"] = len(digests) == 1
+        digests[vehicle] = link["vehicles"][vehicle]["map_digest"] = _digest(queue)
+    link["is_same_map"] = len(set(digests.values())) == 1
+    if link["is_same_map"]:
+        return []
+    told = ", ".join(f"{vehicle} {digest}" for vehicle, digest in digests.items())
+    return [f"The vehicles' maps are not the same, byte for byte: {told}."]
 
 
-def _digest(queue: MapQueue) -> bytes:
+def _digest(queue: MapQueue) -> str:
+    """Of the map's cells and their place; empty without a map."""
     occupancy = queue.global_map()
     if occupancy is None:
-        return b""
-    return hashlib.blake2b(repr(occupancy.spec).encode() + occupancy.values.tobytes()).digest()
+        return ""
+    data = repr(occupancy.spec).encode() + occupancy.values.tobytes()
+    return hashlib.blake2b(data, digest_size=8).hexdigest()
 
 
 def known_over_time(link: Mapping[str, Any]) -> Figure:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from uw_dslam_ros2.cli.running.link_watch import Known, what_is_open
 from uw_dslam_ros2.cli.running.processes import Child, Children, free_domain
 from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig
-from uw_dslam_ros2.core.merging import SubmapState
 from uw_dslam_ros2.io.sessions.session import SESSION_FOLDER
 
 __all__ = ["DEFAULT_LINK_RATE", "LINK_PRESETS", "LinkedMission", "run_linked"]
@@ -25,6 +25,7 @@ _NODES = "uw_dslam_ros2.ros.nodes"
 _START_TIMEOUT_S = 180.0
 _FINISH_TIMEOUT_S = 300.0
 _SETTLE_TIMEOUT_S = 600.0
+_REST_S = 3.0
 _LINK_PATIENCE_S = 1800.0  # of recorded time, after the last ping
 _CLOCK_HZ = 2.0
 _MAX_LAG_S = 20.0
@@ -52,28 +53,6 @@ class LinkedMission:
         """Where a vehicle's manager saves what it knows; the first one's is the demo's."""
         first = vehicle == self.vehicles[0]
         return (out if first else out / "vehicles" / vehicle) / SESSION_FOLDER
-
-
-@dataclass(slots=True)
-class _Known:
-    """What one vehicle's manager knew when; times in recorded seconds."""
-
-    vehicle: str
-    num_submaps: list[tuple[float, int]] = field(default_factory=list)
-    joined_s: dict[str, float] = field(default_factory=dict)
-    revisions: dict[tuple[str, int, int], int] = field(default_factory=dict)
-
-    def look(self, status: Any, now_s: float) -> None:
-        """Note how much it knows, and whom it has joined."""
-        if status is None:
-            return
-        self.revisions = {(s.vehicle_id, s.run_id, s.sequence): s.revision for s in status.submaps}
-        if not self.num_submaps or self.num_submaps[-1][1] != len(self.revisions):
-            self.num_submaps.append((now_s, len(self.revisions)))
-        merged = {s.vehicle_id for s in status.submaps if s.state == SubmapState.MERGED}
-        if self.vehicle in merged:
-            for vehicle in sorted(merged - {self.vehicle}):
-                self.joined_s.setdefault(vehicle, now_s)
 
 
 def run_linked(
@@ -115,7 +94,7 @@ class _Run:
         self._controls = [
             stack.enter_context(MissionControl(domain_id, self._check)) for domain_id in domains
         ]
-        self._known = [_Known(vehicle) for vehicle in mission.vehicles]
+        self._known = [Known(vehicle) for vehicle in mission.vehicles]
         self._begun_s = time.monotonic()
 
     def run(self, begin: Callable[[str, str], None]) -> tuple[list[str], dict[str, Any]]:
@@ -139,17 +118,15 @@ class _Run:
         ]
         end_s = self._look()
         begin("registering", "waiting for the last packets and registrations")
-        complete_s, is_settled = self._settle(end_s)
+        complete_s, still_open = self._settle(end_s)
         begin("saving", "saving through the managers' services")
         for index, vehicle in vehicles:
             folder = mission.session_folder(self._out, vehicle)
             folder.parent.mkdir(parents=True, exist_ok=True)
             self._controls[index].save_session(str(folder))
         notes = [note for i, _ in vehicles for note in self._controls[i].notes_on(answers[i])]
-        if not is_settled:
-            notes.append("A queue was still registering, or a link sending, when the demo ended.")
-        if complete_s is None:
-            notes.append("Not every submap had crossed the link when the demo ended.")
+        if still_open:
+            notes.append(f"When the demo ended, {', '.join(still_open)}.")
         return notes, self._facts(end_s, complete_s)
 
     def _check(self) -> None:
@@ -174,30 +151,36 @@ class _Run:
             known.revisions == first for known in self._known
         )
 
-    def _is_at_rest(self) -> bool:
-        """Whether that is so, and no link has anything left to send."""
-        links = [control.diagnostics_of("acoustic_link") for control in self._controls[:-1]]
-        return self._is_complete() and all(link.get("items to send") == "0" for link in links)
+    def _what_is_open(self) -> list[str]:
+        """What is missing until all have the same map for good."""
+        links, managers = (
+            [control.diagnostics_of(node) for control in self._controls[:-1]]
+            for node in ("acoustic_link", "map_queue_manager")
+        )
+        found = what_is_open(self._mission.vehicles, links, managers)
+        return found if self._is_complete() else ["not every vehicle has every submap", *found]
 
-    def _settle(self, end_s: float) -> tuple[float | None, bool]:
-        """When every manager knew every submap, if ever; and whether all came to rest."""
+    def _settle(self, end_s: float) -> tuple[float | None, list[str]]:
+        """When every manager knew every submap, if ever; and what was missing in the end."""
         complete_s: float | None = None
-        until_s = time.monotonic() + _SETTLE_TIMEOUT_S
+        settled: dict[tuple[str, int, int], int] = {}
+        rest_s = time.monotonic()
+        until_s = rest_s + _SETTLE_TIMEOUT_S
+        found = self._what_is_open()
         while (now_s := self._look()) < end_s + _LINK_PATIENCE_S and time.monotonic() < until_s:
-            if complete_s is None and self._is_complete():
-                complete_s = now_s
-            if not self._is_at_rest():
-                continue
-            before = self._known[0].revisions
-            for control in self._controls[:-1]:
-                control.settle_queue()
-            for control in self._controls[:-1]:
-                control.wait_until_settled(_SETTLE_TIMEOUT_S, lambda _: None)
-            self._look()
-            # What was found now are answers, which cross the link yet.
-            if self._is_at_rest() and self._known[0].revisions == before:
-                return complete_s, True
-        return complete_s, False
+            found = self._what_is_open()
+            if found:
+                rest_s = time.monotonic()
+            if self._is_complete():
+                complete_s = complete_s or now_s
+                if settled != self._known[0].revisions:
+                    settled = dict(self._known[0].revisions)
+                    for control in self._controls[:-1]:
+                        control.settle_queue()
+            # What is told is a second old, and what was found last may be on its way to a link.
+            if time.monotonic() - rest_s > _REST_S:
+                break
+        return complete_s, found
 
     def _facts(self, end_s: float, complete_s: float | None) -> dict[str, Any]:
         """What the report says of the link."""
@@ -212,33 +195,10 @@ class _Run:
             "last_ping_s": round(end_s, 1),
             "complete_after_last_ping_s": late_s,
             "vehicles": {
-                known.vehicle: _facts_of(known, control.diagnostics_of("acoustic_link"))
+                known.vehicle: known.facts(control.diagnostics_of("acoustic_link"))
                 for known, control in zip(self._known, self._controls, strict=False)
             },
         }
-
-
-def _facts_of(known: _Known, told: Mapping[str, str]) -> dict[str, Any]:
-    sent: dict[str, dict[str, int]] = {}
-    for name, value in told.items():
-        for unit in ("packets", "bytes"):
-            if (kind := name.removeprefix(f"sent {unit} ")) != name:
-                sent.setdefault(kind, {})[unit] = int(value)
-    return {
-        "num_submaps_known": len(known.revisions),
-        "num_submaps_known_s": [[round(at_s, 1), num] for at_s, num in known.num_submaps],
-        "joined_s": {name: round(at_s, 1) for name, at_s in known.joined_s.items()},
-        "sent": sent,
-        "received_packets": int(told.get("received packets", 0)),
-        "received_bytes": int(told.get("received bytes", 0)),
-        "repeated_packets": int(told.get("repairs", 0)),
-        "duplicates": int(told.get("duplicates", 0)),
-        "refused": {
-            name.removeprefix("refused: "): int(value)
-            for name, value in told.items()
-            if name.startswith("refused: ")
-        },
-    }
 
 
 # --- processes -------------------------------------------------------------------------------

@@ -248,6 +248,15 @@ class AcousticLink:
         """Own items that somebody lacks, or that were not sent yet."""
         return self._outbox.num_open(self._peers(now_s))
 
+    def num_unconfirmed(self, now_s: float) -> int:
+        """Own items of which some vehicle that is heard has not said that it has them."""
+        return self._outbox.num_unconfirmed(self._peers(now_s))
+
+    @property
+    def num_lacking(self) -> int:
+        """Items that others are known to have said and that are not here."""
+        return sum(inbox.num_lacking for inbox in self._inboxes.values())
+
     @property
     def is_complete(self) -> bool:
         """Whether all that the others are known to have said is here."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.drawn.trajectories import Trajectory, trajectories_of
@@ -173,12 +175,26 @@ class MapQueue(SteeredQueue):
         )
         return [(answer, answer.query.key in used) for answer in by_question]
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing more is expected, and nothing is left to ask."""
+        return not (self.is_growing or self._plan().wanted or self.num_in_flight)
+
     def settled_answers(self) -> list[Answer]:
-        """Answers that the map rests on now that all is asked; none while anything is open."""
-        plan = self._plan()
-        if self.is_growing or plan.wanted or self.num_in_flight:
+        """Answers that the map rests on; none until all is settled."""
+        if not self.is_settled:
             return []
-        return [self._answers[key] for key in sorted(plan.visited) if key in self._answers]
+        return [self._answers[key] for key in sorted(self._plan().visited) if key in self._answers]
+
+    def map_digest(self) -> bytes:
+        """Of what the global map is drawn from (8 bytes): who has the same has the same map."""
+        merged = self._merged()
+        withdrawn = self._decisions.withdrawn(merged)
+        hasher = hashlib.blake2b(repr(self._now.frame.lattice).encode(), digest_size=8)
+        for submap_id, T in sorted(merged.items()):
+            hasher.update(repr((submap_id, submap_id in withdrawn, *T.as_array())).encode())
+            hasher.update(self._submaps[submap_id].fingerprint)
+        return hasher.digest()
 
     def maps_of(self, query: Query) -> tuple[OccupancyMap, OccupancyMap]:
         """Source and target of a question, whose submaps are held."""

@@ -78,6 +78,8 @@ class StatusPublisher:
         self.values |= {"num_in_flight": num_in_flight, "num_servers": num_servers}
         self.values["num_submaps"] = len(records)
         self.values["is_growing"] = int(queue.is_growing)
+        self.values["is_settled"] = int(queue.is_settled)
+        self.values["map_digest"] = queue.map_digest().hex()
         self.values |= _residuals(queue, constraints)
 
     @property

@@ -220,6 +220,8 @@ class AcousticLinkNode(Node):
                 "vehicles heard": sum(1 for n in range(32) if link.age_s(n, now_s) is not None),
                 "submaps known": sum(1 for _ in link.outlines()),
                 "items to send": link.num_open(now_s),
+                "items unconfirmed": link.num_unconfirmed(now_s),
+                "items lacking": link.num_lacking,
                 "loss": link.loss,
                 "received packets": counts.received_packets,
                 "received bytes": counts.received_bytes,

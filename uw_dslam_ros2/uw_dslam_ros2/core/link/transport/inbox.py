@@ -38,6 +38,11 @@ class Inbox:
         """Whether nothing is known that has not come."""
         return self._base >= self._num_items and not self._open
 
+    @property
+    def num_lacking(self) -> int:
+        """Items that are known of and have not come."""
+        return self._num_items - self._base - len(self._done)
+
     def has(self, number: int) -> bool:
         """Whether an item has come."""
         return number < self._base or number in self._done

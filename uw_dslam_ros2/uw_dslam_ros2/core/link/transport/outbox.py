@@ -154,6 +154,14 @@ class Outbox:
         known = list(peers)
         return sum(self._left(item, known) > 0 for item in self.items)
 
+    def num_unconfirmed(self, peers: Iterable[int]) -> int:
+        """Items of which some peer has not said that it has them."""
+        known = list(peers)
+        return sum(
+            not item.is_void and any(item.peers.get(p, (1, 0))[0] > 0 for p in known)
+            for item in self.items
+        )
+
     def _left(self, item: OutItem, peers: list[int], spare: int = 0) -> int:
         if item.is_void:
             return 0
