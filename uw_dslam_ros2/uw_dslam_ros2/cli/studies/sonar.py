@@ -125,10 +125,12 @@ def _simulated(real: _Pings, seed: int) -> NDArray[np.uint8]:
 
 def _draw(path: Path, real: _Pings, found: list[Detections]) -> None:
     made, axes = figure(1, len(found), width=4.0 * len(found), height=4.6)
+    # Older releases of matplotlib do not find the edges of cells that are no rectangles.
+    range_m, bearing_rad = _edges(real.range_m), _edges(real.bearing_rad)
     for axis, image, detections in zip(axes[0], real.image, found, strict=True):
-        x = real.range_m[:, None] * np.cos(real.bearing_rad)
-        y = real.range_m[:, None] * np.sin(real.bearing_rad)
-        axis.pcolormesh(-y, x, image, cmap="gray", shading="nearest", rasterized=True)
+        x = range_m[:, None] * np.cos(bearing_rad)
+        y = range_m[:, None] * np.sin(bearing_rad)
+        axis.pcolormesh(-y, x, image, cmap="gray", rasterized=True)
         axis.plot(-detections.points[:, 1], detections.points[:, 0], ".", ms=2, color=COLOURS[1])
         axis.set_title(f"{len(detections.points)} detections")
         axis.set_aspect("equal")
@@ -136,6 +138,12 @@ def _draw(path: Path, real: _Pings, found: list[Detections]) -> None:
         axis.grid(visible=False)
     axes[0, 0].set_ylabel("ahead [m]")
     save_figure(made, path)
+
+
+def _edges(centers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where cells (K,) begin and end (K + 1,), by their centres."""
+    inner = 0.5 * (centers[1:] + centers[:-1])
+    return np.concatenate([[2 * centers[0] - inner[0]], inner, [2 * centers[-1] - inner[-1]]])
 
 
 def _draw_histogram(path: Path, real: NDArray[np.uint8], simulated: NDArray[np.uint8]) -> None:
