@@ -177,9 +177,9 @@ def _replay(nodes: _Nodes, control: MissionControl, bag: Path, duration_s: float
         peak_mb = [max(pair) for pair in zip(peak_mb, nodes.memory_mb(), strict=True)]
     played_s = time.monotonic() - begun_s
     used = [after - was for after, was in zip(nodes.cpu_s(), before, strict=True)]
-    said = control.finish_mappers([_VEHICLE], _FINISH_S)[_VEHICLE]
+    told = control.finish_mappers([_VEHICLE], _FINISH_S)[_VEHICLE]
     behind_s = time.monotonic() - begun_s - played_s
-    num_mapped, num_sent = int(said.split()[0]), round(duration_s * _RATE_HZ)
+    num_mapped, num_sent = int(told["num_pings"]), round(duration_s * _RATE_HZ)
     emit(
         "onboard",
         {

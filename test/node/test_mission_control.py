@@ -15,21 +15,21 @@ pytestmark = pytest.mark.ros
 S = 10**9
 
 
-def notes_on(answer, run_ids):
+def notes_on(num_bad, run_ids):
     submaps = [SimpleNamespace(vehicle_id="auv_1", run_id=run) for run in run_ids]
     submaps.append(SimpleNamespace(vehicle_id="auv_2", run_id=99))
     control = SimpleNamespace(status=SimpleNamespace(submaps=submaps))
-    return MissionControl.notes_on(control, {"auv_1": answer})
+    return MissionControl.notes_on(control, {"auv_1": {"num_bad": str(num_bad)}})
 
 
 def test_nothing_is_noted_where_nothing_went_wrong():
-    assert notes_on("20 pings mapped into 2 submaps; 0 bad messages", [7, 7]) == []
+    assert notes_on(0, [7, 7]) == []
 
 
 def test_messages_that_were_left_out_and_runs_that_broke_are_noted():
-    (bad,) = notes_on("20 pings mapped into 2 submaps; 10 bad messages", [7])
-    assert bad.startswith("auv_1: 20 pings")
-    (broken,) = notes_on("20 pings mapped into 2 submaps; 0 bad messages", [7, 8, 7])
+    (bad,) = notes_on(10, [7])
+    assert bad.startswith("auv_1 left 10 bad messages out")
+    (broken,) = notes_on(0, [7, 8, 7])
     assert "auv_1 began anew" in broken
     assert "2 runs" in broken
 

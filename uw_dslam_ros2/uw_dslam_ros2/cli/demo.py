@@ -309,14 +309,14 @@ def _replay(
             steps.begin("replaying", "replaying the bags, as fast as the mappers keep up")
             player = _start_player(children, args.rate, recordings)
             _follow(control, player, children.check)
-            answers = control.finish_mappers(recordings.vehicles, _FINISH_TIMEOUT_S)
+            told = control.finish_mappers(recordings.vehicles, _FINISH_TIMEOUT_S)
             steps.begin("registering", "waiting for the last registrations")
             control.settle_queue()
             is_settled = _settle(control, steps)
             steps.begin("saving", "saving through the manager's services")
             problem = control.save_map(str(out / "global_map"))
             control.save_session(str(out / SESSION_FOLDER))
-            notes = control.notes_on(answers)
+            notes = control.notes_on(told)
     if problem:
         notes.append(f"The manager saved no map: {problem}.")
     if not is_settled:

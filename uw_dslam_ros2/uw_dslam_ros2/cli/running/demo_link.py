@@ -112,7 +112,7 @@ class _Run:
         self._begun_s = time.monotonic()
         while any(player.poll() is None for player in players):
             self._look()
-        answers = [
+        told = [
             self._controls[index].finish_mappers([vehicle], _FINISH_TIMEOUT_S)
             for index, vehicle in vehicles
         ]
@@ -124,7 +124,7 @@ class _Run:
             folder = mission.session_folder(self._out, vehicle)
             folder.parent.mkdir(parents=True, exist_ok=True)
             self._controls[index].save_session(str(folder))
-        notes = [note for i, _ in vehicles for note in self._controls[i].notes_on(answers[i])]
+        notes = [note for i, _ in vehicles for note in self._controls[i].notes_on(told[i])]
         if still_open:
             notes.append(f"When the demo ended, {', '.join(still_open)}.")
         return notes, self._facts(end_s, complete_s)

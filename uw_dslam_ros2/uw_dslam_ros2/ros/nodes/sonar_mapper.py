@@ -355,6 +355,7 @@ class SonarMapper(ManagedNode):
             self._troubles.complain(misfit)
         values: dict[str, float | int | str] = {
             **dict(sorted((self._troubles.counts + self._outputs.counts).items())),
+            "num_bad": self._troubles.counts["num_bad"],
             "num_frames": self._mountings.num_frames,
             "num_late": self._order.num_late,
             "num_waiting": self._worker.num_waiting,

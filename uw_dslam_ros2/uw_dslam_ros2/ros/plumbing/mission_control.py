@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
@@ -47,6 +48,7 @@ class MissionControl:
         self.status: MergeStatus | None = None
         self._node.create_subscription(MergeStatus, "/merge_status", self._on_status, LATCHED)
         self._diagnostics: dict[str, dict[str, str]] = {}
+        self._num_told: Counter[str] = Counter()
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._on_diagnostics, DEFAULT
         )
@@ -73,12 +75,14 @@ class MissionControl:
 
     def _on_diagnostics(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
-            values = {value.key: value.value for value in status.values}
-            self._diagnostics[status.name.split(": ")[-1]] = values
+            node = f"/{status.name.split(': ')[0]}"
+            self._diagnostics[node] = {value.key: value.value for value in status.values}
+            self._num_told[node] += 1
 
     def diagnostics_of(self, node: str) -> dict[str, str]:
-        """What a node of that name told last; empty where it told nothing."""
-        return dict(self._diagnostics.get(node, {}))
+        """What a node of that name, in any namespace, told last; empty where it told nothing."""
+        told = (values for name, values in self._diagnostics.items() if name.endswith(f"/{node}"))
+        return dict(next(told, {}))
 
     def spin(self) -> None:
         """Take what has come in, for a tenth of a second at most."""
@@ -117,25 +121,33 @@ class MissionControl:
             timeout_s,
         )
 
-    def finish_mappers(self, vehicles: Sequence[str], timeout_s: float) -> dict[str, str]:
-        """Close every vehicle's last submap; returns what each mapper said."""
+    def finish_mappers(
+        self, vehicles: Sequence[str], timeout_s: float
+    ) -> dict[str, dict[str, str]]:
+        """Close every vehicle's last submap; returns what each mapper's diagnostics say then."""
+        nodes = {vehicle: f"/{vehicle}/sonar_mapper" for vehicle in vehicles}
         futures = {
-            vehicle: self._call(Trigger, f"/{vehicle}/sonar_mapper/finish", Trigger.Request())
-            for vehicle in vehicles
+            vehicle: self._call(Trigger, f"{node}/finish", Trigger.Request())
+            for vehicle, node in nodes.items()
         }
-        answers: dict[str, str] = {}
         for vehicle, future in futures.items():
             self.wait_until(future.done, f"the end of {vehicle}'s mapping", timeout_s)
             response: Any = future.result()
             if not response.success:
                 raise DataError(f"{vehicle} could not finish its map: {response.message}")
-            answers[vehicle] = response.message
-        return answers
+        # One may have been on its way already.
+        enough = {node: self._num_told[node] + 2 for node in nodes.values()}
+        self.wait_until(
+            lambda: all(self._num_told[node] >= num for node, num in enough.items()),
+            "the diagnostics of every mapper",
+            timeout_s,
+        )
+        return {vehicle: dict(self._diagnostics[node]) for vehicle, node in nodes.items()}
 
-    def notes_on(self, answers: Mapping[str, str]) -> list[str]:
-        """What a report has to tell of the mapping; `answers` are those of `finish_mappers`."""
+    def notes_on(self, told: Mapping[str, Mapping[str, str]]) -> list[str]:
+        """What a report has to tell of the mapping; `told` is what `finish_mappers` returned."""
         notes = []
-        for vehicle, answer in answers.items():
+        for vehicle, values in told.items():
             submaps = [] if self.status is None else self.status.submaps
             num_runs = len({s.run_id for s in submaps if s.vehicle_id == vehicle})
             if num_runs > 1:
@@ -143,8 +155,11 @@ class MissionControl:
                     f"{vehicle} began anew on its way: its map is {num_runs} runs, which only "
                     "registration joins. The log of its mapper says why."
                 )
-            if not answer.endswith(" 0 bad messages"):
-                notes.append(f"{vehicle}: {answer}. The log of its mapper says which.")
+            num_bad = int(values["num_bad"])
+            if num_bad:
+                notes.append(
+                    f"{vehicle} left {num_bad} bad messages out. The log of its mapper says which."
+                )
         return notes
 
     def settle_queue(self, timeout_s: float = 60.0) -> None:
