@@ -11,7 +11,7 @@ from uw_dslam_ros2.core.link.transport.packets import (
     MIN_PACKET_BYTES,
 )
 
-__all__ = ["LinkConfig", "LinkCounts", "LinkState", "ReceivedState"]
+__all__ = ["LinkConfig", "LinkCounts", "LinkState", "OwnState", "ReceivedState"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +74,15 @@ class ReceivedState:
     """Of items that are not complete: number, parts needed, index and content of each fragment."""
 
 
+OwnState = tuple[bytes, float, str, int, int, bool]
+"""Of an own item: content, rank, label, parts, fragments sent, and whether it is void."""
+
+
 @dataclass(frozen=True, slots=True)
 class LinkState:
     """What must outlive a restart."""
 
     epoch: int
-    own: tuple[tuple[bytes, float, str, int, int, bool], ...]
-    """Content, rank, label, parts, fragments sent, and whether it is void, of each item."""
+    own: tuple[OwnState, ...]
     received: dict[int, ReceivedState]
     """Of each sender."""
