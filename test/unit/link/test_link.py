@@ -212,10 +212,12 @@ def test_a_restarted_link_has_parts_of_what_was_coming():
     assert new.counts.duplicates == 0
 
 
-def test_a_link_that_forgot_everything_begins_a_new_epoch():
+@pytest.mark.parametrize("epoch", [1, 4])
+def test_a_link_that_forgot_everything_begins_a_new_epoch(epoch):
+    """Of the epoch, packets tell only two bits: those of 4 are as before."""
     talk = fleet()
     talk.until_all_know(6, 200.0)
-    talk.links[1] = AcousticLink(LinkConfig(number=1), "auv_1", epoch=1)
+    talk.links[1] = AcousticLink(LinkConfig(number=1), "auv_1", epoch=epoch)
     talk.got[1] = {}
     talk.add(own_submap(1, 2))
     talk.run(400.0)

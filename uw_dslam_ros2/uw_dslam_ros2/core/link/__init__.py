@@ -10,11 +10,12 @@ from uw_dslam_ros2.core.link.coding.codec import (
 )
 from uw_dslam_ros2.core.link.coding.items import LayerKey
 from uw_dslam_ros2.core.link.coding.outline import Outline
-from uw_dslam_ros2.core.link.link import AcousticLink
+from uw_dslam_ros2.core.link.link import NUM_EPOCHS, AcousticLink
 from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState, ReceivedState
 
 __all__ = [
     "CODEC_VERSION",
+    "NUM_EPOCHS",
     "AcousticLink",
     "CellLayer",
     "Layer",

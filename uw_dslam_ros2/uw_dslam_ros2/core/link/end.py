@@ -15,9 +15,11 @@ from uw_dslam_ros2.core.link.own import ANSWER_RANK, DECISION_RANK, ECHO_RANK, O
 from uw_dslam_ros2.core.link.types import LinkConfig, LinkCounts, LinkState
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 
-__all__ = ["MAX_DECISION_BYTES", "LinkEnd"]
+__all__ = ["MAX_DECISION_BYTES", "NUM_EPOCHS", "LinkEnd"]
 
 MAX_DECISION_BYTES = 1000
+NUM_EPOCHS = 1 << 18
+"""Two bits of it are in every packet, the others in reports."""
 
 
 class LinkEnd:
@@ -25,7 +27,8 @@ class LinkEnd:
 
     def __init__(self, config: LinkConfig, name: str, epoch: int = 0) -> None:
         self._config, self._key = config, config.key.encode()
-        self._name, self._epoch = name, epoch % 4
+        self._name = name
+        self._life, self._epoch = divmod(epoch % NUM_EPOCHS, 4)
         self.counts = LinkCounts()
         self._held = HeldSubmaps(config.number, name, self._key)
         self._own = OwnItems(config.number, name, self._key, self._held)
@@ -164,7 +167,8 @@ class LinkEnd:
 
     def to_state(self) -> LinkState:
         """Everything that was received, and what was said."""
-        return LinkState(self._epoch, self._own.states(), self._heard.states())
+        epoch = 4 * self._life + self._epoch
+        return LinkState(epoch, self._own.states(), self._heard.states())
 
     @classmethod
     def from_state(cls, config: LinkConfig, name: str, state: LinkState) -> Self:
@@ -173,6 +177,7 @@ class LinkEnd:
         link._own.put_back(state.own)
         for sender, received in state.received.items():
             inbox = link._heard.begin(sender, received.epoch)
+            inbox.life = received.life
             for number, item in received.items:
                 link._take_item(sender, item)
                 link._heard.keep(sender, number, item)

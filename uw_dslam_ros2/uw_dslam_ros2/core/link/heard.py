@@ -70,7 +70,10 @@ class Heard:
         """What must outlive a restart."""
         return {
             sender: ReceivedState(
-                inbox.epoch, tuple(sorted(self.items[sender].items())), inbox.fragments()
+                inbox.epoch,
+                tuple(sorted(self.items[sender].items())),
+                inbox.fragments(),
+                inbox.life,
             )
             for sender, inbox in self.inboxes.items()
         }

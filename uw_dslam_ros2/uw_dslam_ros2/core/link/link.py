@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.link.coding.items import ItemKind, Status, read_note
-from uw_dslam_ros2.core.link.end import MAX_DECISION_BYTES, LinkEnd
+from uw_dslam_ros2.core.link.end import MAX_DECISION_BYTES, NUM_EPOCHS, LinkEnd
 from uw_dslam_ros2.core.link.reporting import Reporting, fitted
 from uw_dslam_ros2.core.link.transport.inbox import Inbox
 from uw_dslam_ros2.core.link.transport.packets import (
@@ -21,7 +21,7 @@ from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED, Relays
 from uw_dslam_ros2.core.link.types import LinkConfig
 from uw_dslam_ros2.core.submap import Submap
 
-__all__ = ["MAX_DECISION_BYTES", "AcousticLink"]
+__all__ = ["MAX_DECISION_BYTES", "NUM_EPOCHS", "AcousticLink"]
 
 
 class AcousticLink(LinkEnd):
@@ -34,7 +34,7 @@ class AcousticLink(LinkEnd):
     name
         The vehicle_id, told to the others.
     epoch
-        0 to 3; another one than before, if what was sent before is forgotten.
+        0 to `NUM_EPOCHS` - 1; another one than before, if what was sent before is forgotten.
     """
 
     def __init__(self, config: LinkConfig, name: str, epoch: int = 0) -> None:
@@ -100,7 +100,8 @@ class AcousticLink(LinkEnd):
         """What has come, as a note."""
         self._reporting.told(now_s)
         reports = self._heard.reports(self._reporting.num_reports)
-        status = Status(len(self._outbox.items), self._outbox.voids(peers)[:8], reports)
+        voids = self._outbox.voids(peers)[:8]
+        status = Status(len(self._outbox.items), voids, reports, life=self._life)
         return fitted(status, self._room)
 
     # --- packets in --------------------------------------------------------------------------
@@ -129,13 +130,12 @@ class AcousticLink(LinkEnd):
         else:
             self._heard.last_s[sender] = now_s
         if inbox is None or inbox.epoch != packet.epoch:
-            inbox = self._heard.begin(sender, packet.epoch)
-            self._outbox.forget(sender)
+            inbox = self._begun(sender, packet.epoch)
         before = inbox.num_duplicates
         try:
             if packet.num_needed == 0:
                 for note in unbundled(packet.payload):
-                    self._take_note(sender, inbox, note)
+                    self._take_note(sender, note)
             else:
                 self._relays.overhear(sender, inbox.whole_number(packet.number))
                 self._take_found(sender, inbox.add(packet))
@@ -144,12 +144,20 @@ class AcousticLink(LinkEnd):
         self.counts.duplicates += inbox.num_duplicates - before
         return self._held.improved(sender)
 
-    def _take_note(self, sender: int, inbox: Inbox, note: bytes) -> None:
-        said = read_note(note)
+    def _begun(self, sender: int, epoch: int) -> Inbox:
+        """The inbox of a sender that has nothing of before, and knows nothing of what came."""
+        self._outbox.forget(sender)
+        return self._heard.begin(sender, epoch)
+
+    def _take_note(self, sender: int, note: bytes) -> None:
+        said, inbox = read_note(note), self._heard.inboxes[sender]
         if isinstance(said, bytes):
             self._relays.overhear(sender, read_framed(said)[0])
             self._take_found(sender, inbox.add_whole(said))
         else:
+            if inbox.life not in (None, said.life):  # it began anew, by chance with that epoch
+                inbox = self._begun(sender, inbox.epoch)
+            inbox.life = said.life
             inbox.expect(said.num_items, said.voids)
             self._reporting.num_news += not inbox.is_complete  # tell what is lacking
             for other, its_inbox in self._heard.inboxes.items():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from uw_dslam_ros2.core.link.coding.items import PeerReport, Status
 from uw_dslam_ros2.core.link.transport.packets import bundled
 from uw_dslam_ros2.core.link.types import LinkConfig
@@ -87,7 +89,9 @@ def _shortened(status: Status) -> Status:
     longest = max(status.peers, key=lambda sender: len(status.peers[sender].lacking), default=None)
     if longest is None or not status.peers[longest].lacking:
         fewer = dict(list(status.peers.items())[:-1])
-        return Status(status.num_items, status.voids[:-1], fewer, bool(status.peers))
+        return dataclasses.replace(
+            status, voids=status.voids[:-1], peers=fewer, is_cut=bool(status.peers)
+        )
     report = status.peers[longest]
     short = PeerReport(report.epoch, report.base, report.lacking[:-1], True)
-    return Status(status.num_items, status.voids, status.peers | {longest: short}, status.is_cut)
+    return dataclasses.replace(status, peers=status.peers | {longest: short})

@@ -72,6 +72,8 @@ class ReceivedState:
     """Numbers and content."""
     fragments: tuple[tuple[int, int, int, bytes], ...]
     """Of items that are not complete: number, parts needed, index and content of each fragment."""
+    life: int | None = None
+    """What its reports say beyond the epoch."""
 
 
 OwnState = tuple[bytes, float, str, int, int, bool]

@@ -24,6 +24,7 @@ def save_link_state(path: str | Path, state: LinkState) -> None:
         "received": {
             str(sender): {
                 "epoch": received.epoch,
+                "life": received.life,
                 "items": [[number, item.hex()] for number, item in received.items],
                 "fragments": [[*name, data.hex()] for *name, data in received.fragments],
             }
@@ -66,6 +67,7 @@ def load_link_state(path: str | Path) -> LinkState | None:
                     (number, needed, index, bytes.fromhex(data))
                     for number, needed, index, data in received["fragments"]
                 ),
+                received.get("life"),
             )
             for sender, received in content["received"].items()
         },

@@ -17,7 +17,7 @@ from std_msgs.msg import Empty, UInt8MultiArray
 from uw_dslam_msgs.msg import Submap as SubmapMsg
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError, InvalidInputError
-from uw_dslam_ros2.core.link import AcousticLink, LinkConfig, LinkState
+from uw_dslam_ros2.core.link import NUM_EPOCHS, AcousticLink, LinkConfig, LinkState
 from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 from uw_dslam_ros2.io.sessions.link_state import load_link_state, save_link_state
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg, submap_id_of, submap_to_msg
@@ -104,7 +104,7 @@ class AcousticLinkNode(Node):
         state = load_link_state(self._config.state) if self._config.state else None
         if state is None:
             # The others must not take what comes now for what came before.
-            return AcousticLink(config, self._vehicle_id, secrets.randbelow(4))
+            return AcousticLink(config, self._vehicle_id, secrets.randbelow(NUM_EPOCHS))
         link = AcousticLink.from_state(config, self._vehicle_id, state)
         num_submaps = sum(1 for _ in link.submaps())
         self.get_logger().info(f"went on with {num_submaps} submaps from {self._config.state}")

@@ -25,7 +25,7 @@ __all__ = [
 
 _MAX_NAME_BYTES = 64
 _MAX_ENTRIES = 200
-_RUN_BYTES = 2
+_RUN_BYTES = _LIFE_BYTES = 2
 
 
 class ItemKind(enum.IntEnum):
@@ -142,6 +142,8 @@ class Status:
     peers: dict[int, PeerReport] = field(default_factory=dict)
     is_cut: bool = False
     """Whether there was no room for all peers; else nothing has come of those not named."""
+    life: int = 0
+    """16 bits that the sender has drawn when it began with nothing: packets tell only two."""
 
     def of(self, sender: int, epoch: int) -> PeerReport | None:
         """What has come of a sender since an epoch began; None where that is not said."""
@@ -154,6 +156,7 @@ class Status:
         """To a note."""
         writer = ByteWriter()
         writer.fixed(ItemKind.STATUS, 1)
+        writer.fixed(self.life, _LIFE_BYTES)
         writer.varint(self.num_items)
         writer.varint(2 * len(self.voids) + self.is_cut)
         for number in self.voids:
@@ -169,7 +172,7 @@ class Status:
     @classmethod
     def read(cls, reader: ByteReader) -> Status:
         """Undo `pack`."""
-        num_items = reader.varint()
+        life, num_items = reader.fixed(_LIFE_BYTES), reader.varint()
         head = reader.bounded("the number of void items, twice", 0, 2 * _MAX_ENTRIES)
         voids = tuple(reader.varint() for _ in range(head // 2))
         peers = {}
@@ -179,7 +182,7 @@ class Status:
             values = [reader.fixed(1) for _ in range(num)]
             lacking = tuple(None if value == 255 else value for value in values)
             peers[first >> 3] = PeerReport(first & 3, base, lacking, bool(first & 4))
-        return cls(num_items, voids, peers, bool(head & 1))
+        return cls(num_items, voids, peers, bool(head & 1), life)
 
 
 def whole_note(framed_item: bytes) -> bytes:

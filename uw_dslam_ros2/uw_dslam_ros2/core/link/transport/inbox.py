@@ -27,6 +27,8 @@ class Inbox:
 
     def __init__(self, epoch: int) -> None:
         self.epoch = epoch
+        self.life: int | None = None
+        """What the sender's reports say beyond the epoch; None until one has come."""
         self.num_duplicates = 0
         self._base = 0  # all items below are here
         self._done: set[int] = set()  # of those from there on
