@@ -169,8 +169,6 @@ class _Run:
         found = self._what_is_open()
         while (now_s := self._look()) < end_s + _LINK_PATIENCE_S and time.monotonic() < until_s:
             found = self._what_is_open()
-            if found:
-                rest_s = time.monotonic()
             if self._is_complete():
                 complete_s = complete_s or now_s
                 if settled != self._known[0].revisions:
@@ -178,7 +176,9 @@ class _Run:
                     for control in self._controls[:-1]:
                         control.settle_queue()
             # What is told is a second old, and what was found last may be on its way to a link.
-            if time.monotonic() - rest_s > _REST_S:
+            if found:
+                rest_s = time.monotonic()
+            elif time.monotonic() - rest_s > _REST_S:
                 break
         return complete_s, found
 
