@@ -14,6 +14,9 @@ from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.link import AcousticLink, Layer, LinkConfig
 from uw_dslam_ros2.core.link.coding.answers import encode_answer
 from uw_dslam_ros2.core.link.coding.fields import digest_of
+from uw_dslam_ros2.core.link.coding.items import ItemKind, read_item, read_layer
+from uw_dslam_ros2.core.link.coding.moves import Move
+from uw_dslam_ros2.core.link.held import HeldSubmaps
 from uw_dslam_ros2.core.link.transport.packets import OVERHEAD_BYTES
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.maps.fleets import make_result
@@ -169,6 +172,58 @@ def test_a_pose_can_move_without_the_grid_at_hand():
     assert talk.got[2][moved.submap_id].T_odom_submap.x == pytest.approx(9.0)
     with pytest.raises(InvalidInputError, match="moves before it has come"):
         link.move_submap(own_submap(1, 5))
+
+
+def test_a_move_of_what_all_have_takes_little_and_outlives_restarts_and_losses():
+    talk = fleet(loss=0.3)
+    talk.until_all_know(6, 300.0)
+    talk.run(talk.now_s + 100.0)  # all is confirmed
+    for x_m in (1.0, 2.0):
+        for sequence in range(2):
+            moved = dataclasses.replace(
+                own_submap(1, sequence, revision=int(x_m)), T_odom_submap=SE2(x_m, 2.0, 3.0)
+            )
+            talk._note(1, talk.links[1].move_submap(moved))
+        talk.run(talk.now_s + 3.0)
+    for number in (1, 2):
+        state = talk.links[number].to_state()
+        talk.links[number] = AcousticLink.from_state(
+            LinkConfig(number=number), f"auv_{number}", state
+        )
+    talk.run(talk.now_s + 300.0)
+    assert same_everywhere(talk)
+    assert {s.T_odom_submap.x for s in talk.got[3].values() if s.vehicle_id == "auv_1"} == {2.0}
+    items = [item for item in talk.links[1]._outbox.items if item.label == "moved"]
+    assert all(len(item.content) <= 24 for item in items)
+    assert sum(not item.is_void for item in items) == 2
+
+
+def test_a_move_waits_for_the_outline_that_it_moves():
+    """Cells were drawn anew, and the move of the new ones comes before these."""
+    first, second = Talk(num=2), own_submap(1, 0, revision=1, seed=5)
+    link, other = first.links[1], first.links[2]
+    first.add(own_submap(1, 0))
+    first.until_all_know(1, 100.0)
+    first.run(200.0)
+    first.add(second)
+    first.until_all_know(1, 300.0)
+    moved = dataclasses.replace(second, revision=2, T_odom_submap=SE2(1.0, 2.0, 3.0))
+    first.run(400.0)
+    link.move_submap(moved)
+    item = next(item for item in link._outbox.items if item.label == "moved")
+    held = HeldSubmaps(2, "auv_2", b"")
+    layers = [i.content for i in link._outbox.items if i.label in ("outline", "coarse", "fine")]
+    for content_bytes in [*layers[:3], item.content, *layers[3:]]:
+        kind, body = read_item(content_bytes)
+        if kind is ItemKind.MOVED:
+            held.take_move(1, Move.read(body))
+            assert held.submaps[1, 77, 0].outline.revision == 0
+        else:
+            held.take_layer(1, *read_layer(body))
+    assert held.submaps[1, 77, 0].outline.revision == 2
+    first.run(500.0)
+    outline = other.outlines()[1, 77, 0].outline
+    assert outline.T_odom_submap.y == held.submaps[1, 77, 0].outline.T_odom_submap.y == 2.0
 
 
 def test_what_was_overtaken_need_not_arrive():

@@ -9,6 +9,7 @@ from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.link.coding.answers import decode_answer
 from uw_dslam_ros2.core.link.coding.codec import Layer, LayeredSubmap
 from uw_dslam_ros2.core.link.coding.items import ItemKind, read_hello, read_item, read_layer
+from uw_dslam_ros2.core.link.coding.moves import Move
 from uw_dslam_ros2.core.link.heard import Heard
 from uw_dslam_ros2.core.link.held import HeldSubmaps
 from uw_dslam_ros2.core.link.own import ANSWER_RANK, DECISION_RANK, ECHO_RANK, OwnItems
@@ -50,7 +51,7 @@ class LinkEnd:
 
     def move_submap(self, submap: Submap) -> list[Submap]:
         """Take a new pose of an own submap, whose cells are as before; as `add_submap`."""
-        self._own.move_submap(submap)
+        self._own.move_submap(submap, self._heard.last_s.keys())
         return self._held.improved(self._config.number)
 
     def add_answer(self, answer: bytes) -> None:
@@ -150,6 +151,8 @@ class LinkEnd:
             self._held.take_layer(sender, key, data)
             if key.layer is Layer.OUTLINE:
                 self._own.rank_cells()
+        elif kind is ItemKind.MOVED:
+            self._held.take_move(sender, Move.read(body))
         elif kind is ItemKind.ANSWER:
             decode_answer(body.rest)  # else it is refused
             self._heard.tell(kind, body.rest)

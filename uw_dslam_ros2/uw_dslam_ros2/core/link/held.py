@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.link.coding.codec import Layer, LayeredSubmap, read_outline
 from uw_dslam_ros2.core.link.coding.items import LayerKey
+from uw_dslam_ros2.core.link.coding.moves import Move
 from uw_dslam_ros2.core.submap import Submap
 
 __all__ = ["HeldSubmaps"]
@@ -31,6 +32,7 @@ class HeldSubmaps:
         self.submaps: dict[Place, LayeredSubmap] = {}
         self._number, self._key = number, key
         self._waiting: dict[tuple[int, LayerKey], bytes] = {}  # finer layers that came too early
+        self._moves: dict[Place, Move] = {}  # of outlines that have not come
         self._given: dict[Place, int] = {}  # revision of the submap given out
 
     def own(self, key: LayerKey) -> LayeredSubmap | None:
@@ -71,9 +73,24 @@ class HeldSubmaps:
         if held.add(data) is not key.layer:
             raise InvalidInputError(f"a layer came as {key.layer.name}, which it is not")
         self.submaps[place] = held
+        if key.layer is Layer.OUTLINE and (move := self._moves.pop(place, None)) is not None:
+            self.take_move(sender, move)
         fine = LayerKey(key.run, key.sequence, Layer.FINE)
         if key.layer is Layer.COARSE and (early := self._waiting.pop((sender, fine), None)):
             self.take_layer(sender, fine, early)
+
+    def take_move(self, sender: int, move: Move) -> None:
+        """Move a submap; kept until its outline has come, if it is not the one that is here."""
+        place = (sender, move.key.run, move.key.sequence)
+        held = self.submaps.get(place)
+        outline = None if held is None else held.outline
+        if outline is not None and outline.revision >= move.revision:
+            return
+        moved = None if outline is None else move.applied(outline, self._key)
+        if held is not None and moved is not None:
+            held.add(moved)
+        else:
+            self._moves[place] = move
 
     def improved(self, sender: int) -> list[Submap]:
         """Submaps of a vehicle as they are now, if they were not given out like that before."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.link.coding.codec import Layer, encode_submap, write_outline
@@ -15,6 +15,7 @@ from uw_dslam_ros2.core.link.coding.items import (
     read_item,
     read_layer,
 )
+from uw_dslam_ros2.core.link.coding.moves import Move, move_item
 from uw_dslam_ros2.core.link.held import HeldSubmaps
 from uw_dslam_ros2.core.link.transport.outbox import Outbox, OutItem
 from uw_dslam_ros2.core.link.types import OwnState
@@ -52,6 +53,7 @@ class OwnItems:
         self.outbox = Outbox()
         self._number, self._name, self._key, self._held = number, name, key, held
         self._layers: dict[LayerKey, OutItem] = {}
+        self._moves: dict[LayerKey, OutItem] = {}
         self._sources: dict[tuple[int, int], Submap] = {}
         self.outbox.add(hello_item(name), _OUTLINE_RANK, "hello")
 
@@ -63,8 +65,8 @@ class OwnItems:
             self._say(LayerKey.of(submap.run_id, submap.sequence, layer), data)
         self.rank_cells()
 
-    def move_submap(self, submap: Submap) -> None:
-        """Say the pose of a submap whose cells are as before."""
+    def move_submap(self, submap: Submap, peers: Collection[int]) -> None:
+        """Say the pose of a submap whose cells are as before, to these peers."""
         key = LayerKey.of(submap.run_id, submap.sequence, Layer.OUTLINE)
         held = self._held.own(key)
         if held is None or held.outline is None:
@@ -76,7 +78,12 @@ class OwnItems:
             T_odom_submap=submap.T_odom_submap,
             covariance=submap.covariance,
         )
-        self._say(key, write_outline(outline, self._key))
+        data = write_outline(outline, self._key)
+        if self.outbox.is_confirmed(self._layers[key], peers):
+            self._held.take_layer(self._number, key, data)
+            self._move(key, move_item(key, outline, data))
+        else:
+            self._say(key, data)
 
     def submap(self, submap_id: SubmapId) -> Submap | None:
         """A submap as it came or, after a restart, as the others have it."""
@@ -106,6 +113,11 @@ class OwnItems:
                 key, data = read_layer(body)
                 self._layers[key] = item
                 self._held.take_layer(self._number, key, data)
+            elif kind is ItemKind.MOVED:
+                move = Move.read(body)
+                self._held.take_move(self._number, move)
+                if not is_void:
+                    self._moves[move.key] = item
 
     def states(self) -> tuple[OwnState, ...]:
         """For `put_back`."""
@@ -113,7 +125,17 @@ class OwnItems:
             (i.content, i.rank, i.label, i.parts, i.num_sent, i.is_void) for i in self.outbox.items
         )
 
+    def _move(self, key: LayerKey, content: bytes) -> None:
+        """Say a move in the place of the one before it."""
+        before = self._moves.get(key)
+        if before is None:
+            self._moves[key] = self.outbox.add(content, _MOVED_RANK, "moved")
+        elif before.content != content:
+            self._moves[key] = self.outbox.replace(before, content)
+
     def _say(self, key: LayerKey, data: bytes) -> None:
+        if key.layer is Layer.OUTLINE and (move := self._moves.pop(key, None)) is not None:
+            move.is_void = True
         item, content = self._layers.get(key), layer_item(key, data)
         self._held.take_layer(self._number, key, data)
         if item is None:

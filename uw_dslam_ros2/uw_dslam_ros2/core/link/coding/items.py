@@ -38,6 +38,7 @@ class ItemKind(enum.IntEnum):
     WHOLE = 5
     """Of a note: an item that needs no cutting."""
     DECISION = 6
+    MOVED = 7
 
 
 @dataclass(frozen=True, slots=True, order=True)

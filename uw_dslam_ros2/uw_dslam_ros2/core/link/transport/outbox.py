@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.link.coding.items import PeerReport, whole_note
@@ -153,6 +153,11 @@ class Outbox:
         """Items of which something is left to send."""
         known = list(peers)
         return sum(self._left(item, known) > 0 for item in self.items)
+
+    @staticmethod
+    def is_confirmed(item: OutItem, peers: Collection[int]) -> bool:
+        """Whether these peers, of whom there is one at least, have said that they have an item."""
+        return bool(peers) and all(item.peers.get(peer, (1, 0))[0] == 0 for peer in peers)
 
     def num_unconfirmed(self, peers: Iterable[int]) -> int:
         """Items of which some peer has not said that it has them."""
