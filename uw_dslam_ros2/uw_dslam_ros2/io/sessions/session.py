@@ -7,18 +7,14 @@ the state of the last start, for when the file is damaged, and the lock of who i
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import logging
-import os
 import shutil
-import socket
 import sqlite3
 from pathlib import Path
-from typing import IO
 
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
+from uw_dslam_ros2.io.sessions.folder_lock import FolderLock, SessionInUseError
 from uw_dslam_ros2.io.sessions.session_file import (
     FIRST_VERSION,
     VERSIONS,
@@ -45,13 +41,8 @@ GOOD_FILE = "session.good.sqlite"
 """Copy of the session as it was read, whole, at the last start."""
 SESSION_FOLDER = "session"
 """Where a result folder of ``offline`` or ``demo`` keeps its session."""
-_LOCK_FILE = "session.lock"
 _EXTRA_BYTES = 1 << 26
 """Beyond the cells of its grid, what a submap may hold: points and path."""
-
-
-class SessionInUseError(DataError):
-    """Another process is writing the session."""
 
 
 class Session:
@@ -65,7 +56,7 @@ class Session:
 
     def __init__(self, folder: str | Path) -> None:
         self._folder = Path(folder)
-        self._lock: IO[str] | None = None
+        self._lock = FolderLock(self._folder, "manager")
         self._records = StateRecords()
 
     def __enter__(self) -> Session:
@@ -85,7 +76,7 @@ class Session:
             Naming the file, the records that are damaged, and where the copy of the last start is.
         """
         try:
-            self._acquire()
+            self._lock.acquire()
         except SessionInUseError:
             raise
         except DataError as error:
@@ -93,7 +84,7 @@ class Session:
         if not has_session(self._folder):
             return None
         queue = load_session(self._folder, config)
-        if self._lock is not None:
+        if self._lock.is_held:
             self._keep_copy()
         return queue
 
@@ -112,7 +103,7 @@ class Session:
         DataError
             Naming the file and the reason; the session is then as it was.
         """
-        self._acquire()
+        self._lock.acquire()
         path = self._folder / SESSION_FILE
         try:
             write_records(path, self._records.of(queue.to_state()))
@@ -122,35 +113,7 @@ class Session:
 
     def close(self) -> None:
         """Let others have the folder."""
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
-
-    def _acquire(self) -> None:
-        path = self._folder / _LOCK_FILE
-        if self._lock is not None and _is_same_file(self._lock, path):
-            return
-        self.close()
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            lock = path.open("a+")
-        except OSError as error:
-            raise DataError(f"cannot write to the session {self._folder}: {error}") from error
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.seek(0)
-            holder = lock.read(200).strip() or "another process"
-            lock.close()
-            raise SessionInUseError(
-                f"the session {self._folder} is written by {holder}; give each manager a folder "
-                "of its own"
-            ) from None
-        self._lock = lock
-        with contextlib.suppress(OSError):  # on a full disk: it names us to others, no more
-            lock.truncate(0)
-            lock.write(f"process {os.getpid()} on {socket.gethostname()}")
-            lock.flush()
+        self._lock.release()
 
     def _keep_copy(self) -> None:
         copy = self._folder / GOOD_FILE
@@ -214,11 +177,3 @@ def load_session(folder: str | Path, config: MapQueueConfig | None = None) -> Ma
         raise DataError(
             f"{path} is not a whole session: {error}{remedy if good.is_file() else ''}"
         ) from error
-
-
-def _is_same_file(file: IO[str], path: Path) -> bool:
-    """Whether an open file is still what the path names: its disk may have been exchanged."""
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except OSError:
-        return False

@@ -20,6 +20,7 @@ __all__ = [
     "VERSION",
     "VERSIONS",
     "Record",
+    "RecordName",
     "opened",
     "read_records",
     "write_records",

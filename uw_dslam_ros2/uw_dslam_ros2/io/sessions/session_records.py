@@ -23,7 +23,13 @@ from uw_dslam_ros2.io.sessions.array_files import arrays_from_bytes, arrays_to_b
 from uw_dslam_ros2.io.sessions.decisions import decision_from_plain, decision_to_plain
 from uw_dslam_ros2.io.sessions.session_file import Record
 
-__all__ = ["StateRecords", "first_version_state", "state_of"]
+__all__ = [
+    "StateRecords",
+    "first_version_state",
+    "state_of",
+    "submap_from_bytes",
+    "submap_to_bytes",
+]
 
 
 class StateRecords:
@@ -41,7 +47,7 @@ class StateRecords:
             digest = held[1] if held and held[0] is submap else _submap_digest(submap)
             digests[submap.submap_id] = submap, digest
             records["submap", json.dumps(submap.submap_id)] = Record(
-                digest, partial(_submap_to_bytes, submap)
+                digest, partial(submap_to_bytes, submap)
             )
         self._digests = digests
         for decision in state.decisions:
@@ -113,7 +119,7 @@ def _assembled(
     return QueueState(
         tuple(
             sorted(
-                (_submap_from_bytes(content, max_bytes) for content in submaps),
+                (submap_from_bytes(content, max_bytes) for content in submaps),
                 key=lambda submap: submap.submap_id,
             )
         ),
@@ -181,13 +187,15 @@ def _submap_digest(submap: Submap) -> bytes:
     return hasher.digest()
 
 
-def _submap_to_bytes(submap: Submap) -> bytes:
+def submap_to_bytes(submap: Submap) -> bytes:
+    """All of a submap."""
     arrays: dict[str, Any] = {n: np.asarray(getattr(submap, n)) for n in _SUBMAP_ARRAYS}
     header = np.frombuffer(_submap_header(submap), dtype=np.uint8)
     return arrays_to_bytes({"header": header, "values": submap.grid.values, **arrays})
 
 
-def _submap_from_bytes(content: bytes, max_bytes: int) -> Submap:
+def submap_from_bytes(content: bytes, max_bytes: int) -> Submap:
+    """The submap of such bytes; `DataError` if it would take more than so many."""
     arrays = arrays_from_bytes(content, max_bytes)
     header = json.loads(arrays["header"].tobytes())
     grid = OccupancyMap(_spec_from_plain(header.pop("spec")), arrays["values"])

@@ -23,6 +23,7 @@ from uw_dslam_ros2.io.readings import PINGS, TransformEvent
 from uw_dslam_ros2.ros.mapper.convention_watch import ConventionWatch
 from uw_dslam_ros2.ros.mapper.last_pass import LastPass
 from uw_dslam_ros2.ros.mapper.outputs import MapperOutputs
+from uw_dslam_ros2.ros.mapper.run_keeper import RunKeeper
 from uw_dslam_ros2.ros.mapper.sensor_silence import SensorSilence
 from uw_dslam_ros2.ros.mapper.sensor_topics import SensorTopics
 from uw_dslam_ros2.ros.mapper.services import MapperServices
@@ -80,6 +81,8 @@ class SonarMapper(ManagedNode):
             int(self._mapper_config.max_gap_s * 1e9),
         )
         self._troubles = MapperTroubles(self, self._vehicle_id)
+        self._keeper = RunKeeper(self._config.session, occupancy, self._troubles.complain)
+        self.at_end(self._keeper.close)
         self._mapper_values: dict[str, float | int | str] = {}
         self._odom_stamp_ns = 0
         self._map_stamp_ns = 0
@@ -240,7 +243,7 @@ class SonarMapper(ManagedNode):
         self._begin_run(RunBreak("", newest_ns, stamp_ns))
 
     def _begin_run(self, reason: RunBreak) -> None:
-        self._outputs.publish_submaps(self._runs.begin(reason))
+        self._give(self._runs.begin(reason))
         self._odom_stamp_ns = self._map_stamp_ns = 0
         self._is_finished = False
         self._troubles.counts["num_restarts"] += 1
@@ -283,7 +286,7 @@ class SonarMapper(ManagedNode):
         except InvalidInputError as error:
             self._troubles.complain(f"{type(event).__name__} of {event.frame_id}: {error}")
             return
-        self._outputs.publish_submaps(submaps)
+        self._give(submaps)
         self._last_pass.look()
         if self._troubles.note_breaks(self._runs):
             self._odom_stamp_ns = self._map_stamp_ns = 0
@@ -330,6 +333,11 @@ class SonarMapper(ManagedNode):
         self._close_last()
         drawn_anew = self._last_pass.draw(self._runs.mappers())
         self._outputs.publish_submaps(drawn_anew, is_drawn_anew=True)
+        self._keeper.forget_own()
+        num_earlier = 0
+        for earlier in self._keeper.earlier_drawn_anew():
+            self._outputs.publish_submaps(earlier, is_drawn_anew=True)
+            num_earlier += len(earlier)
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is not None:
             self._publish_map(stamp_ns)
@@ -339,14 +347,20 @@ class SonarMapper(ManagedNode):
         self._mapper_values = self._runs.diagnostics()
         return (
             f"{self._mapper_values['num_pings']} pings mapped into "
-            f"{self._mapper_values['num_submaps']} submaps, {len(drawn_anew)} of them drawn anew; "
+            f"{self._mapper_values['num_submaps']} submaps, {len(drawn_anew)} of them drawn anew"
+            f"{f', and {num_earlier} of before it was started' if num_earlier else ''}; "
             f"{self._troubles.counts['num_bad']} bad messages"
         )
 
     def _close_last(self) -> None:
         self._flush()
-        self._outputs.publish_submaps(self._runs.finish())
+        self._give(self._runs.finish())
         self._is_finished = True
+
+    def _give(self, submaps: list[Submap]) -> None:
+        """Give submaps away; a process that is killed in between has kept them."""
+        self._keeper.keep(submaps, self._last_pass.pings.of_submap)
+        self._outputs.publish_submaps(submaps)
 
     # --- diagnostics -------------------------------------------------------------------------
 

@@ -46,6 +46,11 @@ class SonarMapperConfig(SensorConfig):
         600.0,
         "a sensor is waited for this long, to use all in order [s]; 0: 1, or 60 if reliable",
     )
+    session: str = setting(
+        "",
+        doc="folder in which it keeps its pings, so that `finish` draws anew what it had mapped "
+        "before it was killed, too; one for each vehicle and mission; empty: none",
+    )
     map_period_s: float = setting(
         2.0, 0.1, 3600.0, "between two maps, by the pings' stamps and by a steady clock [s]"
     )

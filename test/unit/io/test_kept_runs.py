@@ -1,0 +1,127 @@
+"""What a mapper keeps of a run comes back as it was given away last."""
+
+import dataclasses
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.io.sessions.folder_lock import SessionInUseError
+from uw_dslam_ros2.io.sessions.kept_runs import KeptRuns
+
+RUN_ID = 77
+
+
+def submap_of(rng, sequence):
+    return Submap(
+        vehicle_id="auv_1",
+        sequence=sequence,
+        revision=0,
+        is_final=True,
+        stamp_ns=5 * sequence,
+        T_odom_submap=SE2(*rng.normal(size=3)),
+        covariance=np.diag(rng.random(3)),
+        grid=OccupancyMap(GridSpec(0.1, 30, 40), rng.integers(-1, 101, (30, 40)).astype(np.int8)),
+        points=rng.normal(size=(5, 2)),
+        trajectory=rng.normal(size=(4, 3)),
+        trajectory_stamp_ns=np.arange(4, dtype=np.int64),
+        run_id=RUN_ID,
+    )
+
+
+def ping_of(rng, stamp_ns, bearing_rad, num_points):
+    return DrawnPing(
+        stamp_ns,
+        SE2(*rng.normal(size=3)),
+        rng.normal(size=(num_points, 2)).astype(np.float32),
+        rng.random(num_points).astype(np.float32),
+        bearing_rad,
+        rng.random(len(bearing_rad)).astype(np.float32),
+        0.01,
+        0.05,
+    )
+
+
+@pytest.fixture
+def run(rng):
+    """Three submaps, of which the last has no pings, and those of the others."""
+    submaps = [submap_of(rng, sequence) for sequence in range(3)]
+    fan, turn = np.linspace(-1.0, 1.0, 7), np.linspace(-3.0, 3.0, 4)
+    pings = {
+        submaps[0].submap_id: [ping_of(rng, t, fan, n) for t, n in ((1, 3), (2, 0), (3, 6))],
+        submaps[1].submap_id: [ping_of(rng, 4, fan, 2), ping_of(rng, 5, turn, 1)],
+    }
+    return submaps, pings
+
+
+def assert_equal(found, expected):
+    for name in (field.name for field in dataclasses.fields(expected)):
+        one, other = getattr(found, name), getattr(expected, name)
+        if isinstance(other, np.ndarray):
+            assert one.dtype == other.dtype, name
+            np.testing.assert_array_equal(one, other)
+        elif name == "grid":
+            assert one.spec == other.spec
+            np.testing.assert_array_equal(one.values, other.values)
+        else:
+            assert one == other, name
+
+
+def test_a_run_comes_back_with_its_pings_and_its_last_poses(run, rng, tmp_path):
+    submaps, pings = run
+    kept = KeptRuns(tmp_path)
+    kept.save(submaps[:2], pings)
+    moved = dataclasses.replace(submaps[0], revision=4, T_odom_submap=SE2(*rng.normal(size=3)))
+    kept.save([moved, submaps[2]], pings)
+    kept.close()
+
+    with closing(KeptRuns(tmp_path)) as later:
+        (path,) = later.earlier
+        found, found_pings = later.load(path)
+    for one, other in zip(found, [moved, *submaps[1:]], strict=True):
+        assert_equal(one, other)
+    for submap in submaps:
+        of_it = found_pings[submap.submap_id]
+        for one, other in zip(of_it, pings.get(submap.submap_id, []), strict=True):
+            assert_equal(one, other)
+    # What one sonar's pings have in common takes memory once.
+    first, second, _ = found_pings[submaps[0].submap_id]
+    assert first.bearing_rad is second.bearing_rad
+
+
+def test_a_damaged_run_is_named(run, tmp_path):
+    kept = KeptRuns(tmp_path)
+    kept.save(*run)
+    (path,) = tmp_path.glob("run_*.sqlite")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with closing(kept), pytest.raises(DataError, match=f"{path.name} is not a whole run"):
+        kept.load(path)
+
+
+def test_two_mappers_do_not_share_a_folder(tmp_path):
+    kept = KeptRuns(tmp_path)
+    with pytest.raises(SessionInUseError, match="give each mapper a folder of its own"):
+        KeptRuns(tmp_path)
+    kept.close()
+    KeptRuns(tmp_path).close()
+
+
+def test_what_is_forgotten_is_gone(run, tmp_path):
+    kept = KeptRuns(tmp_path)
+    kept.save(*run)
+    kept.close()
+    later = KeptRuns(tmp_path)
+    later.save([dataclasses.replace(run[0][0], run_id=78)], {})
+    later.forget(later.earlier[0])
+    assert [path.name for path in tmp_path.glob("run_*")] == ["run_78.sqlite"]
+    later.forget_own()
+    assert list(tmp_path.glob("run_*")) == []
+    assert later.earlier == []
+    later.close()
