@@ -244,16 +244,17 @@ def test_what_a_killed_mapper_kept_is_drawn_anew_by_the_next_one(ros_context, sp
         until(vehicle.is_connected, "connection")
         vehicle.send_mount()
         drive(until, vehicle, range(4))
-        until(lambda: mapper._runs.mapper.num_pings == 8, "the pings")
-        mapper._worker.call(lambda: mapper._give(mapper._runs.finish())).result()
-        mapper._is_finished = True  # as if killed: it has no last word
+        pipeline = mapper._pipeline
+        until(lambda: pipeline._runs.mapper.num_pings == 8, "the pings")
+        # As if killed: no last word.
+        mapper._worker.call(pipeline.close_last).result()
     (kept,) = tmp_path.glob("run_*.sqlite")
     mapper = mapper_of(ros_context, session=str(tmp_path))
     with spinning(mapper, vehicle.node) as until:
         until(vehicle.is_connected, "connection")
         vehicle.send_mount()
         drive(until, vehicle, range(20, 24))
-        until(lambda: vehicle.values().get("num_scan") == "8", "all scans")
+        until(lambda: mapper._pipeline._runs.mapper.num_pings == 8, "the pings")
         message = finish(until, vehicle).message
         assert "1 of them drawn anew, and 1 of before it was started; 0 bad" in message
         until(lambda: len({msg.run_id for msg in vehicle.submaps}) == 2, "both runs")
