@@ -5,6 +5,7 @@ import sqlite3
 
 import numpy as np
 import pytest
+import yaml
 from backports import zstd
 from rosbags import rosbag1
 from rosbags.typesys import Stores, get_typestore
@@ -163,6 +164,53 @@ def without_storage_identifier(bag):
 
 def renamed(bag):
     storage_file(bag).rename(bag / "other_0.mcap")
+
+
+def edited(bag, change):
+    path = bag / "metadata.yaml"
+    content = yaml.safe_load(path.read_text())
+    change(content["rosbag2_bagfile_information"])
+    path.write_text(yaml.safe_dump(content))
+
+
+def without_a_topic(bag):
+    """As a recorder leaves it that found the topic late."""
+
+    def change(information):
+        topics = information["topics_with_message_count"]
+        topics[:] = [t for t in topics if not t["topic_metadata"]["name"].endswith("imu")]
+
+    edited(bag, change)
+
+
+def with_another_quality_of_service(bag):
+    """As merging and editing tools leave it."""
+
+    def change(information):
+        for topic in information["topics_with_message_count"]:
+            topic["topic_metadata"]["offered_qos_profiles"] = []
+
+    edited(bag, change)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("spoil", [without_a_topic, with_another_quality_of_service])
+def test_what_metadata_do_not_tell_of_is_read_all_the_same(tmp_path, spoil, storage):
+    bag = write_bag(tmp_path / "bag", storage)
+    expected = len(list(read_events(bag)))
+    spoil(bag)
+    assert len(list(read_events(bag))) == expected
+    with open_bag(bag) as reader:
+        assert reader.damage == ""
+
+
+def test_a_file_that_metadata_do_not_list_is_told(tmp_path):
+    bag = write_bag(tmp_path / "bag")
+    with open_bag(bag) as reader:
+        assert reader.damage == ""
+    shutil.copy(storage_file(bag), bag / "more_1.mcap")
+    with open_bag(bag) as reader:
+        assert "does not list more_1.mcap" in reader.damage
 
 
 @pytest.mark.parametrize("spoil", [emptied, without_storage_identifier, renamed])

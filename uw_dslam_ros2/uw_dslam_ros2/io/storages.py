@@ -107,7 +107,7 @@ def open_storages(path: Path, stack: ExitStack) -> Storages:
     if path.is_dir():
         if (path / "metadata.yaml").exists():
             try:
-                return [_open_folder(path, stack)], ""
+                return [_open_folder(path, stack)], _unlisted(path)
             except (*BROKEN, OSError) as error:
                 problem = str(error) or type(error).__name__
                 expected = _expected_count(path / "metadata.yaml")
@@ -186,7 +186,40 @@ def _open_folder(path: Path, stack: ExitStack) -> Storage:
         if has_log(file):
             raise ReaderError(f"{file.name} has a write-ahead log")
         check_database_size(file)
-    return cast(Storage, stack.enter_context(Reader(path)))
+    reader = stack.enter_context(Reader(path))
+    if hidden := _hidden_topics(reader):
+        raise ReaderError(f"metadata.yaml does not describe {', '.join(hidden)} as the file does")
+    return cast(Storage, reader)
+
+
+def _hidden_topics(reader: Reader) -> list[str]:
+    """Topics that are in the files, but not as metadata.yaml has them.
+
+    The library reads of a folder what its metadata tell of, topic, type and quality of service,
+    and leaves out the rest without a word.
+    """
+    known = {(c.topic, c.msgtype, str(c.ext)) for c in reader.connections}
+    in_files = {
+        (c.topic, c.msgtype, str(c.ext))
+        for storage in cast(Any, reader.storage).storages
+        for c in storage.connections
+        if c.msgcount
+    }
+    return sorted({topic for topic, _, _ in in_files - known})
+
+
+def _unlisted(path: Path) -> str:
+    """What to say of files that lie in the folder, but are not in its metadata."""
+    content = yaml.safe_load((path / "metadata.yaml").read_text())
+    listed = content["rosbag2_bagfile_information"]["relative_file_paths"]
+    names = {Path(name).name for name in listed}
+    others = [file.name for file in _files_of(path) if file.name not in names]
+    if not others:
+        return ""
+    return (
+        f"its metadata.yaml does not list {', '.join(others)}, and so it is not read; take the "
+        "metadata away to have all files read, or a file that is none of it"
+    )
 
 
 def _open_file(path: Path, stack: ExitStack) -> tuple[Storage, bool]:
