@@ -93,6 +93,7 @@ CASES = {
     "dvl_unit": (dvl(lambda _, v: 1000.0 * v), {"velocity_scale": 0.001}),
     "dvl_scale": (dvl(lambda _, v: 1.05 * v), {"velocity_scale": 1.0 / 1.05}),
     "sound_speed": (sonar(lambda p: 1.05 * p), {"sonar_range_scale": 1.0 / 1.05}),
+    "sonar_range_factor": (sonar(lambda p: 2.0 * p), {"sonar_range_scale": 0.5}),
     "dvl_constant": (dvl(lambda _, v: 0.0 * v), {"velocity_zero_is_invalid": True}),
     "dvl_zero_without_lock": (dvl(without_lock), {"velocity_zero_is_invalid": True}),
     "sonar_mirrored": (sonar(lambda p: p * [1.0, -1.0]), {"sonar_is_mirrored": True}),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import multiprocessing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -14,6 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from uw_dslam_ros2.cli.common import num_processors, num_workers
+from uw_dslam_ros2.cli.running.examining import (
+    ExaminedVehicle,
+    can_be_mapped,
+    examine_vehicle,
+    mountings_of,
+    together,
+)
 from uw_dslam_ros2.core.chart.pings import DrawnPing, KeptPings
 from uw_dslam_ros2.core.clocks import find_gaps
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
@@ -28,9 +35,9 @@ from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.bags import ImuEvent, TransformEvent, TruthEvent
 from uw_dslam_ros2.io.conventions import CorrectedMountings
 from uw_dslam_ros2.io.events import VehicleReader
-from uw_dslam_ros2.io.examining import examine_recording, mended
+from uw_dslam_ros2.io.examining import mended
 from uw_dslam_ros2.io.feeding import feed_runs, in_stamp_order
-from uw_dslam_ros2.io.mountings import Mountings, base_frame_of, role_of
+from uw_dslam_ros2.io.mountings import role_of
 from uw_dslam_ros2.io.readings import FixEvent
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
@@ -41,7 +48,6 @@ __all__ = [
     "VehicleSubmaps",
     "map_recording",
     "map_recordings",
-    "mountings_of",
     "sensor_config",
     "settle",
 ]
@@ -118,18 +124,17 @@ def map_recordings(
     with ProcessPoolExecutor(
         num_processes, mp_context=context, initializer=_share, initargs=(done,)
     ) as pool:
-        futures = []
-        for recording in recordings:
-            name = recording.vehicle_id
-            futures.append(
-                pool.submit(map_recording, recording, config.mapper[name], config.sensors[name])
-            )
+        own = [(r, config.mapper[r.vehicle_id], config.sensors[r.vehicle_id]) for r in recordings]
+        count = (lambda: progress(done.value, total)) if progress is not None else None
         try:
-            while wait(futures, timeout=0.2).not_done:
-                if progress is not None:
-                    progress(done.value, total)
-                _raise_early(futures)
-            return [future.result() for future in futures]
+            examined = together(
+                _results([pool.submit(_examined, *of_one) for of_one in own], count)
+            )
+            futures = [
+                pool.submit(map_recording, *of_one, found)
+                for of_one, found in zip(own, examined, strict=True)
+            ]
+            return _results(futures, count)
         except BrokenProcessPool as error:
             raise DataError(
                 "a mapping process was ended from outside; is there enough memory for "
@@ -140,10 +145,23 @@ def map_recordings(
             raise
 
 
-def _raise_early(futures: list[Future[VehicleSubmaps]]) -> None:
-    for future in futures:
-        if future.done():
-            future.result()
+def _results[T](futures: Sequence[Future[T]], count: Callable[[], None] | None) -> list[T]:
+    """Of all futures in their order, or the first error as soon as it is raised."""
+    while wait(futures, timeout=0.2).not_done:
+        if count is not None:
+            count()
+        for future in futures:
+            if future.done():
+                future.result()
+    return [future.result() for future in futures]
+
+
+def _examined(
+    recording: VehicleRecording, config: VehicleMapperConfig, sensors: SensorConfig
+) -> ExaminedVehicle | None:
+    if not can_be_mapped(recording):
+        return None
+    return examine_vehicle(recording, sensors, config.sonar)
 
 
 _shared: list[Synchronized[int]] = []
@@ -163,15 +181,19 @@ def map_recording(
     recording: VehicleRecording,
     config: VehicleMapperConfig,
     sensors: SensorConfig = SensorConfig(),  # noqa: B008 (frozen)
+    examined: ExaminedVehicle | None = None,
 ) -> VehicleSubmaps:
     """Map one vehicle; `DataError` where its bags cannot be read or a mounting is not known.
 
     A recording without a sonar, or without any heading, makes no map, and findings that say so.
+    `examined` is what was found of it (default: it is examined first, by itself).
     """
-    if "sonar" not in recording.topics or not {"imu", "odometry"} & set(recording.topics):
+    if not can_be_mapped(recording):
         present = {role: SensorCount(1) for role in recording.topics}
         found = health_findings(MappedVehicle(recording.vehicle_id, present, {}))
         return VehicleSubmaps(recording.vehicle_id, (), {}, tuple(found))
+    if examined is None:
+        examined = examine_vehicle(recording, sensors, config.sonar)
     run_ids, kept = itertools.count(1), KeptPings()
     newest: dict[SubmapId, Submap] = {}
     fixes: list[FixEvent] = []
@@ -179,11 +201,12 @@ def map_recording(
     has_yaw = has_yaw_rate = False
     first_ns: int | None = None
     with VehicleReader(recording, sensors) as reader:
-        findings = reader.check_clocks()
+        reader.stamps = dict(examined.stamps)
         mountings = mountings_of(recording, sensors, reader.transforms())
-        examined = examine_recording(recording, sensors, config.sonar, reader.stamps, mountings.of)
-        reader.conventions, sonar, said = mended(examined, sensors.conventions, config.sonar)
-        findings += said
+        reader.conventions, sonar, said = mended(
+            examined.examination, sensors.conventions, config.sonar
+        )
+        findings = [*examined.about_clocks, *said]
         config = dataclasses.replace(config, sonar=sonar)
         corrected = CorrectedMountings(reader.conventions)
         runs = VehicleRuns(config, recording.vehicle_id, lambda: next(run_ids), kept)
@@ -250,20 +273,6 @@ def map_recording(
         kept.of_submap,
         tuple(fixes),
     )
-
-
-def mountings_of(
-    recording: VehicleRecording, sensors: SensorConfig, transforms: Iterable[TransformEvent]
-) -> Mountings:
-    """Where a vehicle's instruments sit."""
-    known = list(transforms)
-    links = {(t.frame_id, t.child_frame_id) for t in known}
-    mountings = Mountings(
-        sensors.base_frame or base_frame_of(links, recording.vehicle_id, recording.namespace)
-    )
-    for transform in known:
-        mountings.add(transform)
-    return mountings
 
 
 def _new_run(reason: RunBreak) -> Finding:

@@ -7,7 +7,19 @@ from dataclasses import dataclass, field
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.findings import Finding
 
-__all__ = ["Examination"]
+__all__ = ["Examination", "ScaleEstimate"]
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleEstimate:
+    """How much farther the echoes move than navigation says: a ratio, and its sigma.
+
+    ``by`` is the role that says how far: ``velocity`` or ``odometry``.
+    """
+
+    ratio: float
+    sigma: float
+    by: str
 
 
 @dataclass(slots=True)
@@ -31,6 +43,8 @@ class Examination:
     """Whether enough motions of the echoes lay within known velocities."""
     pixels: str = ""
     """What the sonar's images hold: compressed, amplitude, power, decibel; "": not known."""
+    scale: ScaleEstimate | None = None
+    """None where too little was seen, where a unit is wrong, or where the sonar is tilted."""
     vehicle_id: str = ""
     """Whose it is."""
 

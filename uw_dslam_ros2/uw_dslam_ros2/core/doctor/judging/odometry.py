@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.judging.scales import confidence_in, is_scale_wrong
+from uw_dslam_ros2.core.doctor.judging.scales import confidence_in, is_scale_wrong, scale_of
 from uw_dslam_ros2.core.doctor.motions.delays import late_in_words
 from uw_dslam_ros2.core.doctor.motions.fits import (
     SURE,
@@ -210,6 +210,7 @@ class _Judge:
         )
 
     def _judge_scale(self, fit: VelocityFit) -> None:
+        self._result.scale = scale_of(fit, "odometry")
         if not is_scale_wrong(fit):
             return
         self._result.tell(

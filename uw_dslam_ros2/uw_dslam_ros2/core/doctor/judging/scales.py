@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from uw_dslam_ros2.core.doctor.examination import Examination
+from uw_dslam_ros2.core.doctor.examination import Examination, ScaleEstimate
 from uw_dslam_ros2.core.doctor.motions.fits import VelocityFit
 
-__all__ = ["confidence_in", "is_scale_wrong", "judge_scale"]
+__all__ = ["confidence_in", "is_scale_wrong", "judge_scale", "scale_of"]
 
 _MIN_SCALE_ERROR = 0.019
 _USUAL_SCALE_ERROR = 0.015
@@ -17,8 +17,10 @@ _UNIT_SCALE = 1.3
 _UNIT_TOLERANCE = 0.025  # tells knots from half
 _UNITS = {
     "millimetres per second": 1e-3, "centimetres per second": 1e-2, "knots": 0.5144,
-    "kilometres per hour": 1.0 / 3.6,
+    "kilometres per hour": 1.0 / 3.6, "feet per second": 0.3048,
 }  # fmt: skip
+_RANGE_FACTORS = (0.5, 2.0, 1.0 / 0.3048)
+"""Of ranges there and back, or half of them; in feet."""
 
 
 def is_scale_wrong(fit: VelocityFit) -> bool:
@@ -27,19 +29,35 @@ def is_scale_wrong(fit: VelocityFit) -> bool:
     return error >= _MIN_SCALE_ERROR and error - 2.0 * fit.factor_sigma >= _USUAL_SCALE_ERROR
 
 
+def scale_of(fit: VelocityFit, by: str) -> ScaleEstimate | None:
+    """What a fit says of the scale; None where it is a unit that is wrong."""
+    if _is_unit_wrong(fit.scale):
+        return None
+    return ScaleEstimate(fit.scale, fit.factor_sigma, by)
+
+
+def _is_unit_wrong(scale: float) -> bool:
+    """Whether a scale is farther from 1 than any water or calibration takes it."""
+    return not 1.0 / _UNIT_SCALE < scale < _UNIT_SCALE
+
+
 def judge_scale(result: Examination, fit: VelocityFit, tilt_rad: float = 0.0) -> None:
     """Tell of a DVL whose unit or scale, or a sonar whose speed of sound, is wrong.
 
-    Of a sonar that looks up or down by ``tilt_rad`` it is said that it does.
+    A large factor that is none of a DVL's units is the sonar's. Of a sonar that looks up or down
+    by ``tilt_rad`` it is said that it does.
     """
+    is_tilted = tilt_rad > _MIN_TILT_RAD
+    if not is_tilted:
+        result.scale = scale_of(fit, "velocity")
     if not is_scale_wrong(fit):
         return
-    if not 1.0 / _UNIT_SCALE < fit.scale < _UNIT_SCALE:
+    if _is_unit_wrong(fit.scale):
         _say_unit(result, fit.scale)
         return
     error = abs(fit.scale - 1.0)
     confidence = confidence_in(error - 0.5 * _MIN_SCALE_ERROR, fit.factor_sigma)
-    if fit.scale < 1.0 and tilt_rad > _MIN_TILT_RAD:
+    if fit.scale < 1.0 and is_tilted:
         result.tell(
             "sonar_tilt",
             "sonar",
@@ -80,18 +98,31 @@ def judge_scale(result: Examination, fit: VelocityFit, tilt_rad: float = 0.0) ->
 
 def _say_unit(result: Examination, scale: float) -> None:
     name, unit = min(_UNITS.items(), key=lambda item: abs(math.log(scale / item[1])))
-    is_unit = abs(math.log(scale / unit)) < _UNIT_TOLERANCE
-    factor = unit if is_unit else scale
-    other = f"conventions.sonar_range_scale: {1.0 / scale:.4g} instead"
-    said = f": it is in {name}" if is_unit else ""
-    mend = "" if is_unit else f"; if it is the sonar's ranges that are wrong, {other}"
+    if _is_near(scale, unit):
+        result.tell(
+            "dvl_unit",
+            "velocity",
+            f"its velocity is {1.0 / scale:.3g} times that of the sonar's echoes: it is in {name} "
+            f"(conventions.velocity_scale: {unit:.4g})",
+            velocity_scale=float(f"{unit:.4g}"),
+        )
+        return
+    # A DVL measures in some unit; the length of a sonar's range bins is often set by hand.
+    plain = min(_RANGE_FACTORS, key=lambda factor: abs(math.log(scale / factor)))
+    factor = plain if _is_near(scale, plain) else scale
     result.tell(
-        "dvl_unit",
-        "velocity",
-        f"its velocity is {1.0 / scale:.3g} times that of the sonar's echoes{said} "
-        f"(conventions.velocity_scale: {factor:.4g}{mend})",
-        velocity_scale=float(f"{factor:.4g}"),
+        "sonar_range_factor",
+        "sonar",
+        f"its echoes move {scale:.3g} times as far as the dvl says, which is no unit that a dvl "
+        "has: the range, the length of its bins or the unit is set wrong "
+        f"(conventions.sonar_range_scale: {1.0 / factor:.4g}); or it is the dvl's scale after "
+        f"all (conventions.velocity_scale: {scale:.4g} instead)",
+        sonar_range_scale=float(f"{1.0 / factor:.4g}"),
     )
+
+
+def _is_near(scale: float, factor: float) -> bool:
+    return abs(math.log(scale / factor)) < _UNIT_TOLERANCE
 
 
 def confidence_in(value: float, sigma: float) -> float:
