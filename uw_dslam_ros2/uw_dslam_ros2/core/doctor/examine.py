@@ -19,7 +19,13 @@ from uw_dslam_ros2.core.doctor.judging.imu import ImuState, compare_yaw_and_rate
 from uw_dslam_ros2.core.doctor.judging.knocks import judge_knock
 from uw_dslam_ros2.core.doctor.judging.odometry import OdometrySample, examine_odometry
 from uw_dslam_ros2.core.doctor.judging.scales import confidence_in, judge_scale
-from uw_dslam_ros2.core.doctor.motions.delays import Delays, find_delays, late_in_words
+from uw_dslam_ros2.core.doctor.judging.turns_and_times import say_delays, say_one_flipped
+from uw_dslam_ros2.core.doctor.judging.velocities import (
+    judge_offset,
+    say_in_world,
+    say_mirrored,
+)
+from uw_dslam_ros2.core.doctor.motions.delays import find_delays
 from uw_dslam_ros2.core.doctor.motions.fits import (
     SURE,
     TurnFit,
@@ -40,7 +46,6 @@ FloatArray = NDArray[np.float64]
 _LIKELY = 0.95  # enough to tell of a late dvl, not to correct it
 _MIN_MOTIONS = 15
 _MIN_READINGS = 20
-_MIN_OFFSET_RAD = math.radians(2.5)
 _MIN_DRIFT_RAD_S = math.radians(0.05)
 _UNIT_LOG = math.log(1.3)
 _MAX_WAY_COST = 1.5  # of a velocity that explains how the echoes move
@@ -132,11 +137,11 @@ class _Trial:
         self._judge_drift(fits[0], apart_rad_s)
         reading: _Reading | None = _Reading(fits[0].sign)
         if rates and orientation and rates[0].sign != orientation[0].sign:
-            self._say_one_flipped(rates[0].sign, orientation[0].sign, orientation)
+            say_one_flipped(self._result, rates[0].sign, orientation[0].sign, orientation)
         elif fits[0].sign < 0:
             reading = self._handedness()
         if reading is None:
-            self._say_delays(find_delays(fits, lambda _: None, SURE, _LIKELY))
+            say_delays(self._result, find_delays(fits, lambda _: None, SURE, _LIKELY))
             return
         if reading == _Reading():
             reading = self._velocity_in_world() or self._velocity_side(reading)
@@ -145,10 +150,14 @@ class _Trial:
         fit = self._fit(chosen, delays.velocity_after_imu_s)
         self._result.is_velocity_judged = fit is not None
         if chosen.is_velocity_in_world:
-            self._say_velocity_in_world(fit)
+            say_in_world(
+                self._result,
+                fit if self._imu.by_orientation is not None else None,
+                self._side_confidence,
+            )
         elif fit is not None and fit.is_mirrored:
-            self._say_velocity_mirrored(fit)
-        self._say_delays(delays)
+            say_mirrored(self._result, fit, self._side_confidence)
+        say_delays(self._result, delays)
         if fit is None:
             return
         if not chosen.is_velocity_in_world:
@@ -163,7 +172,7 @@ class _Trial:
             )
             fit = before or fit
             if not fit.is_mirrored:
-                self._judge_offset(fit)
+                judge_offset(self._result, fit, self._navigation.velocity_m_s)
         judge_scale(self._result, fit, self._tilt_rad)
 
     def _fit(
@@ -204,30 +213,6 @@ class _Trial:
             "echoes do not: its gyro has a bias; let it settle before the dive, or calibrate it",
             confidence_in(bias, sigma),
         )
-
-    # --- who turns the other way
-    # -------------------------------------------------------------------------------------------
-
-    def _say_one_flipped(self, rates: int, orientation: int, fits: list[TurnFit]) -> None:
-        sure = confidence_of(fits[0], fits[1])
-        if orientation < 0:
-            self._result.tell(
-                "imu_ned",
-                "imu",
-                "its yaw turns against its own rates and against the sonar's echoes: it is a "
-                "heading that grows clockwise, as in NED (conventions.imu_orientation: ned)",
-                sure,
-                imu_orientation="ned",
-            )
-        if rates < 0:
-            self._result.tell(
-                "imu_rates_frd",
-                "imu",
-                "its rates turn against its own yaw and against the sonar's echoes: their z axis "
-                "points down (conventions.imu_rates: frd)",
-                sure,
-                imu_rates="frd",
-            )
 
     def _handedness(self) -> _Reading | None:
         """Say who is the wrong way round where the echoes turn against the IMU."""
@@ -273,9 +258,6 @@ class _Trial:
         )
         return None
 
-    # --- the velocity
-    # -------------------------------------------------------------------------------------------
-
     def _velocity_side(self, reading: _Reading) -> _Reading:
         """The reading, with the velocity's sideways axis the other way where that fits better."""
         other = replace(reading, is_velocity_mirrored=True)
@@ -284,58 +266,6 @@ class _Trial:
             return reading
         self._side_confidence = confidence_of(mirrored, plain)
         return other if self._side_confidence > SURE else reading
-
-    def _say_velocity_mirrored(self, fit: VelocityFit) -> None:
-        offset = fit.yaw_rad
-        axes = "exchanged" if abs(abs(offset) - 0.5 * math.pi) < 0.3 else "mirrored"
-        self._result.tell(
-            "dvl_mirrored",
-            "velocity",
-            f"its sideways velocity is against the sonar's echoes: its axes are {axes} "
-            f"(conventions.velocity_is_mirrored: true, conventions.velocity_yaw_offset_rad: "
-            f"{offset:.2f}); or those of the imu and the sonar are, both",
-            self._side_confidence,
-            velocity_is_mirrored=True,
-            velocity_yaw_offset_rad=round(offset, 4) if abs(offset) > _MIN_OFFSET_RAD else 0.0,
-        )
-
-    def _judge_offset(self, fit: VelocityFit) -> None:
-        sigma = fit.factor_sigma / max(fit.scale, 1e-9)
-        offset = fit.yaw_rad
-        if abs(offset) < max(_MIN_OFFSET_RAD, 4.0 * sigma) or sigma > 0.2:
-            return
-        degrees = math.degrees(offset)
-        mean = complex(*np.median(self._navigation.velocity_m_s, axis=0))
-        # A vehicle goes ahead more often than not: who says so is right.
-        by_velocity = abs(np.angle(mean)) + 0.05
-        by_echoes = abs(np.angle(mean * np.exp(1j * offset)))
-        if by_echoes > by_velocity:
-            self._result.tell(
-                "sonar_turned",
-                "sonar",
-                f"its echoes move as if it were mounted {-degrees:.0f} degrees from where tf says "
-                f"(conventions.sonar_yaw_offset_rad: {-offset:.3f}), counter-clockwise",
-                confidence_in(offset, sigma),
-                sonar_yaw_offset_rad=round(-offset, 4),
-            )
-        elif abs(abs(degrees) - 180.0) < 15.0:
-            self._result.tell(
-                "dvl_sign",
-                "velocity",
-                "its velocity has the wrong sign: it is the bottom's against the vehicle "
-                "(conventions.velocity_yaw_offset_rad: 3.1416)",
-                confidence_in(offset, sigma),
-                velocity_yaw_offset_rad=round(math.pi, 4),
-            )
-        else:
-            self._result.tell(
-                "dvl_turned",
-                "velocity",
-                f"its velocity is {-degrees:.0f} degrees off the sonar's motion: it is mounted "
-                f"turned (conventions.velocity_yaw_offset_rad: {offset:.3f})",
-                confidence_in(offset, sigma),
-                velocity_yaw_offset_rad=round(offset, 4),
-            )
 
     def _velocity_in_world(self) -> _Reading | None:
         """The reading along axes that do not turn with the vehicle, where only that fits."""
@@ -352,64 +282,3 @@ class _Trial:
             return None
         self._side_confidence = confidence_of(world, plain)
         return reading if self._side_confidence > SURE else None
-
-    def _say_velocity_in_world(self, fit: VelocityFit | None) -> None:
-        said = (
-            "its velocity is along axes that do not turn with the vehicle (east and north, or "
-            "those of its odometry), while its message says along its own"
-        )
-        if fit is None or self._imu.by_orientation is None:
-            said += ": have its driver give it in the vehicle's frame"
-            self._result.tell("dvl_in_world", "velocity", said, self._side_confidence)
-            return
-        changes: dict[str, str | float | bool] = {
-            "velocity_axes": "world",
-            "velocity_yaw_offset_rad": round(fit.yaw_rad, 4),
-        }
-        if fit.is_mirrored:
-            changes["velocity_is_mirrored"] = True
-        words = ", ".join(f"conventions.{name}: {value}" for name, value in changes.items())
-        self._result.tell(
-            "dvl_in_world",
-            "velocity",
-            f"{said} ({words.replace('True', 'true')})",
-            self._side_confidence,
-            **changes,
-        )
-
-    # --- time
-    # -------------------------------------------------------------------------------------------
-
-    def _say_delays(self, delays: Delays) -> None:
-        either = "" if delays.is_owner_known else "; or it is the {}, which the dvl does not tell"
-        if delays.imu_s:
-            # An orientation that is late by itself is put in time with the rates first.
-            total_s = self._result.conventions.imu_delay_s + delays.imu_s
-            self._result.tell(
-                "imu_delay",
-                "imu",
-                f"its stamps are {late_in_words(delays.imu_s)} than those of sonar and dvl, by "
-                f"how the echoes turn{either.format('sonar')} (conventions.imu_delay_s: "
-                f"{total_s:.2f})",
-                delays.confidence,
-                imu_delay_s=round(total_s, 3),
-            )
-        if delays.sonar_s:
-            self._result.tell(
-                "sonar_delay",
-                "sonar",
-                f"its stamps are {late_in_words(delays.sonar_s)} than the imu's, by how both turn"
-                f"{either.format('imu')} (conventions.sonar_delay_s: {delays.sonar_s:.2f})",
-                delays.confidence,
-                sonar_delay_s=round(delays.sonar_s, 3),
-            )
-        if delays.velocity_s:
-            is_sure = delays.confidence > SURE
-            self._result.tell(
-                "velocity_delay",
-                "velocity",
-                f"its stamps are {late_in_words(delays.velocity_s)} than those of sonar and imu, "
-                f"by how the echoes move (conventions.velocity_delay_s: {delays.velocity_s:.2f})",
-                delays.confidence,
-                **({"velocity_delay_s": round(delays.velocity_s, 3)} if is_sure else {}),
-            )
