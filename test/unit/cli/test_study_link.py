@@ -6,6 +6,7 @@ import pytest
 
 from uw_dslam_ros2.cli.reporting.scoring import Truth
 from uw_dslam_ros2.cli.studies import _link_joining as joining
+from uw_dslam_ros2.cli.studies._finished import FinishedParts
 from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission
 from uw_dslam_ros2.cli.studies._link_joining import Joining, Merged, known_by
 from uw_dslam_ros2.core.merging import MapQueue
@@ -60,6 +61,19 @@ class Fake(Joining):
 def test_the_first_join_is_when_enough_is_known(played, layer, expected):
     mission = FleetMission("two", tuple(SUBMAPS.values()), Truth({}, None))
     assert Fake(mission, layer=layer).first_join_s(played, ONE) == expected
+
+
+def test_a_part_is_made_once_and_anew_by_other_code(tmp_path):
+    made = []
+
+    def make():
+        made.append(1)
+        return {"rows": [{"kB": 1.5, "first_join_s": ""}]}
+
+    for digest, num in (("a", 1), ("a", 1), ("b", 2)):
+        found = FinishedParts(tmp_path / "cache", digest).get("demo 0, nano: 30% lost", make)
+        assert found == {"rows": [{"kB": 1.5, "first_join_s": ""}]}
+        assert len(made) == num
 
 
 def test_a_question_is_searched_once(monkeypatch):

@@ -7,13 +7,16 @@ when everybody had everything, when the first vehicle could first join another, 
 map is worth beside one of full grids: with everything, and with what all have a minute (1000
 bit/s), five (nano) or twenty (rate0) after the last ping. For comparison the bits that descriptors
 of 16 bytes and a cloud of 9 kbit for each submap that is matched (DRACo-SLAM's budget) would take.
+
+A study that was stopped goes on where it was: what is done of each mission is kept in ``cache``.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +30,8 @@ from uw_dslam_ros2.cli.studies._common import (
     save_figure,
     write_csv,
 )
-from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission, demo_mission
+from uw_dslam_ros2.cli.studies._finished import FinishedParts
+from uw_dslam_ros2.cli.studies._fleet_missions import FleetMission, code_digest, demo_mission
 from uw_dslam_ros2.cli.studies._link_joining import Joining, known_by
 from uw_dslam_ros2.core.link import Layer, LayeredSubmap, encode_submap
 from uw_dslam_ros2.core.link.transport.channel import CHANNEL_PRESETS, ChannelConfig
@@ -60,34 +64,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write ``link.csv``, ``link.png`` and tables."""
     rows: list[dict[str, Any]] = []
-    runs: dict[str, LinkRun] = {}
+    shown: dict[str, LinkRun] = {}  # of the first mission
     sizes: list[dict[str, Any]] = []
     merged: list[dict[str, Any]] = []
+    code = code_digest(repr((args.loss, args.no_merging)), "core", "sim", "cli/studies")
+    parts = FinishedParts(args.out / "cache", code)
     for seed in progress(range(args.first_seed, args.first_seed + args.seeds), text="missions"):
         mission = demo_mission(seed, args.out / "cache")
         joining = None if args.no_merging else Joining(mission)
         sizes += [_sizes(mission.name, submap) for submap in mission.submaps]
-        merged += [] if joining is None else _merged_rows(joining)
+        if joining is not None:
+            merged += parts.get(f"{mission.name} layers", functools.partial(_merged_rows, joining))
         for name, (channel, blackouts) in _channels(args.loss, mission.submaps).items():
-            played = run_link(
+            play = functools.partial(
+                run_link,
                 mission.submaps,
                 dataclasses.replace(channel, seed=seed),
                 limit_s=_LIMIT_S,
                 blackouts=blackouts,
             )
-            runs.setdefault(name, played)
-            rows.append(_row(mission, name, played))
-            if joining is not None and not blackouts and channel.access == "tdma":
-                merged += _due_rows(joining, name, played)
+            if seed == args.first_seed:
+                shown[name] = play()
+            is_joined = not blackouts and channel.access == "tdma"
+            make = functools.partial(_channel, mission, joining if is_joined else None, name, play)
+            found = parts.get(f"{mission.name} {name}", make)
+            rows.append(found["row"])
+            merged += found["due"]
     write_csv(args.out / "link.csv", rows)
     write_csv(args.out / "sizes.csv", sizes)
-    _draw_known(runs, args.out / "link.png")
+    _draw_known(shown, args.out / "link.png")
     _report_sizes(sizes)
     _report(rows)
     if merged:
         write_csv(args.out / "merged.csv", merged)
         print_table(list(merged[0]), [list(row.values()) for row in merged])
     return 0
+
+
+def _channel(
+    mission: FleetMission, joining: Joining | None, name: str, play: Callable[[], LinkRun]
+) -> dict[str, Any]:
+    """What one mission's exchange over one channel took, and what could be merged when."""
+    played = play()
+    due = [] if joining is None else _due_rows(joining, name, played)
+    return {"row": _row(mission, name, played), "due": due}
 
 
 def _channels(
