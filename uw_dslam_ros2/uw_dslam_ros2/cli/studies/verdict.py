@@ -6,7 +6,8 @@ and real maps of a list (`--pairs`), with motions that somebody has checked. Hal
 once more with a prior window of random size, and those of one place once more in a mirror, where
 nothing is right. Two small logistic models are fitted: whether a pose is right, from what speaks
 for it by itself, on all refined poses; and whether the best pose is right, in view of the others.
-The first model also says which pose is the best, so after it has changed much the evidence has to
+A line, steeper just above even odds, then makes the second's logit that of what is observed. The
+first model also says which pose is the best, so after it has changed much the evidence has to
 be gathered once more for the second to be that of its choices. The models are judged on other
 seeds, on kinds of places and on lists that the fit never saw. The coefficients that this command
 prints are those to put into `MODELS` of
@@ -18,6 +19,7 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,9 +45,11 @@ from uw_dslam_ros2.cli.studies._verdict_trials import (
 )
 from uw_dslam_ros2.core.registration.grids.judging.probability import (
     MATCH_FEATURES,
+    ODDS_FEATURES,
     POSE_FEATURES,
     VerdictModels,
     match_features,
+    odds_features,
     pose_features,
     probability_of,
     share_left_by_doubts,
@@ -61,10 +65,11 @@ _CHECK_KINDS = ("oblique", "cellular", "cave", "corridors", "harbour", "symmetri
 _OVERLAPS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _FIRST_CHECK = 1000
 _RIDGE = 1.0
+_ODDS_RIDGE = 0.1  # two slopes of one strong feature need hardly be held
 # Which way a feature may speak, if at all; where few pairs tell, chance must not turn it round.
 _SIGNS = {
     "agreement": 1, "conflict": -1, "log_detail": 1, "wall_share": -1, "log_surprise": 1,
-    "log_volume": -1, "pose": 1, "lead": 1, "margin": 1,
+    "log_volume": -1, "pose": 1, "lead": 1, "margin": 1, "match": 1, "rather_right": 1,
 }  # fmt: skip
 _OTHER_WEIGHT = 0.3  # of poses beside that of the highest score: there are several in each pair
 _APART_BINS = (0.05, 0.2, 0.4, 0.5, 1.01)
@@ -136,7 +141,7 @@ def _gathered(
 
 
 def _fitted(trials: list[Trial]) -> VerdictModels:
-    """Both models, one after the other.
+    """The models, one after the other.
 
     A pose in a symmetric place is convincing for itself wherever it is: there, rivals decide. The
     second model is of matches that nothing explains otherwise, and which those are nobody knows:
@@ -154,23 +159,22 @@ def _fitted(trials: list[Trial]) -> VerdictModels:
             is_right.append(is_pose_right)
             weights.append(weight * (1.0 if one.score == highest else _OTHER_WEIGHT))
     pose = _logistic(POSE_FEATURES, features, is_right, weights, [1.0] * len(features))
-    alone = VerdictModels(pose, ())
-    match = _logistic(
-        MATCH_FEATURES,
-        [match_features(trial.evidence, pose) for trial in trials],
-        [trial.is_right for trial in trials],
-        trial_weights,
-        [share_left_by_doubts(trial.evidence, alone) for trial in trials],
-    )
-    return VerdictModels(pose, match)
+    answers = [trial.is_right for trial in trials]
+    most = [share_left_by_doubts(trial.evidence, VerdictModels(pose)) for trial in trials]
+    rows = [match_features(trial.evidence, pose) for trial in trials]
+    models = VerdictModels(pose, _logistic(MATCH_FEATURES, rows, answers, trial_weights, most))
+    pairs = [odds_features(trial.evidence, models) for trial in trials]
+    odds = _logistic(ODDS_FEATURES, pairs, answers, trial_weights, most, _ODDS_RIDGE)
+    return replace(models, odds=(odds[0], odds[1], odds[2]))
 
 
 def _logistic(
     names: Sequence[str],
-    rows: list[tuple[float, ...]],
+    rows: Sequence[tuple[float, ...]],
     is_right: list[bool],
     weights: list[float],
     most: list[float],
+    ridge: float = _RIDGE,
 ) -> tuple[float, ...]:
     """Coefficients, intercept first, of a ridge-regularised logistic model with `_SIGNS`.
 
@@ -187,9 +191,9 @@ def _logistic(
         wrong = 1.0 - share * given
         likelihood = answers * log_expit(logit) + (1.0 - answers) * np.log(wrong)
         slope = weight * ((1.0 - answers) * share * given / wrong - answers) * (1.0 - given)
-        ridge = np.concatenate([[0.0], _RIDGE * model[1:]])
-        gradient = np.concatenate([[slope.sum()], scaled.T @ slope]) + ridge
-        return float(-weight @ likelihood + 0.5 * model @ ridge), gradient
+        pull = np.concatenate([[0.0], ridge * model[1:]])
+        gradient = np.concatenate([[slope.sum()], scaled.T @ slope]) + pull
+        return float(-weight @ likelihood + 0.5 * model @ pull), gradient
 
     bounds = [(0.0, None) if _SIGNS[name] > 0 else (None, 0.0) for name in names]
     start = np.zeros(1 + len(names))
@@ -203,6 +207,7 @@ def _print_models(models: VerdictModels) -> None:
     for name, features, model in (
         ("pose", POSE_FEATURES, models.pose),
         ("match", MATCH_FEATURES, models.match),
+        ("odds", ODDS_FEATURES, models.odds),
     ):
         print_table(
             (f"feature of model {name}", "coefficient"),

@@ -15,12 +15,14 @@ __all__ = [
     "ENOUGH_DETAIL",
     "MATCH_FEATURES",
     "MODELS",
+    "ODDS_FEATURES",
     "POSE_FEATURES",
     "MatchEvidence",
     "PoseEvidence",
     "VerdictModels",
     "lead_over_decoy",
     "match_features",
+    "odds_features",
     "pose_features",
     "pose_logit",
     "probability_of",
@@ -89,8 +91,10 @@ POSE_FEATURES = (
     "log_volume",
 )
 MATCH_FEATURES = ("pose", "lead", "margin")
+ODDS_FEATURES = ("match", "rather_right")
 _RIVAL_SHARES = (0.2, 2.0)  # beyond, a rival's score says no more
 _MOST_MARGIN = 3.0  # logits; beyond, a rival's evidence says no more
+_RATHER_RIGHT = 2.0  # logits above even odds; beyond, the match model is sure
 _MOST_LOGIT = 12.0
 _ONE_OF_TWO = 0.5
 # How often one of two maps has left and right exchanged [logit]: one time in fourteen.
@@ -102,15 +106,21 @@ _BARE = 3.0
 
 @dataclass(frozen=True, slots=True)
 class VerdictModels:
-    """Logistic models, intercept first: of a pose for itself, and of the best of two maps."""
+    """Logistic models, intercept first: of a pose for itself, and of the best of two maps.
+
+    ``odds`` makes the logit of the second that of the probability which is observed: intercept,
+    slope, and what the slope has more just above even odds.
+    """
 
     pose: tuple[float, ...]
-    match: tuple[float, ...]
+    match: tuple[float, ...] = ()
+    odds: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
 
 MODELS = VerdictModels(
     pose=(-1.3292, 1.9783, -20.1197, 0.7012, -4.7006, 2.4299, -0.2288),
     match=(-1.772, 0.8379, 2.2163, 0.7473),
+    odds=(-0.6474, 0.7933, 2.2199),
 )
 """Fitted by the model fit of `study verdict`, each place weighed as one.
 
@@ -118,8 +128,9 @@ The model of a pose is of 1,891 answers: 364 of windows of simulated places, 276
 simulated places that were built apart, 1,251 of real maps; the slope of ``log_volume`` is held at
 what windows with and without priors gave before. The model of a match is of 2,755 answers: 1,125
 of simulated places, 360 of them in a mirror and 123 with a prior; 1,630 of real maps, 528 of them
-in a mirror, 288 windows of lidar maps, and 550 pairs of different places. The real maps are public
-ones and no part of this repository; a list of one's own goes to `--pairs`.
+in a mirror, 288 windows of lidar maps, and 550 pairs of different places. The odds are of 2,884:
+these and more pairs of different places. The real maps are public ones and no part of this
+repository; a list of one's own goes to `--pairs`.
 docs/experiments.md has what other fits would change.
 """
 
@@ -152,6 +163,17 @@ def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tupl
     return best, lead, min(max(margin, 0.0), _MOST_MARGIN)
 
 
+def odds_features(evidence: MatchEvidence, models: VerdictModels) -> tuple[float, float]:
+    """Logit of the match model, and what of it lies just above even odds, as `ODDS_FEATURES`.
+
+    A logistic model is held back by the few matches that are right though nothing speaks for them:
+    those that it thinks rather right than wrong are right far oftener than it says. Where it is
+    sure there are too few wrong ones to say more.
+    """
+    logit = _logit(models.match, match_features(evidence, models.pose))
+    return logit, min(max(logit, 0.0), _RATHER_RIGHT)
+
+
 def _most_alike(evidence: MatchEvidence, pose_model: Sequence[float]) -> float:
     """Logit of the rival that is the most convincing alias of the best pose."""
     logits = [
@@ -181,7 +203,7 @@ def probability_of(
 
     ``is_alone`` asks only how convincing it is, and for nothing that explains it otherwise.
     """
-    alone = _share(_logit(models.match, match_features(evidence, models.pose)))
+    alone = _share(_logit(models.odds, odds_features(evidence, models)))
     if is_alone:
         return alone
     return alone * share_left_by_doubts(evidence, models)
