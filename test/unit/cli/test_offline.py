@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,6 +105,25 @@ def test_a_vehicle_without_a_place_in_the_common_map_is_told() -> None:
     assert (finding.kind, finding.vehicle_id) == ("not_merged", "auv_3")
     assert finding.severity == "warning"
     assert "2%" in finding.sentence  # the verdict's own reason
+    assert "deeper" not in finding.sentence
+
+
+@pytest.mark.parametrize(
+    ("depths_m", "expected"),
+    [
+        ((2.0, 2.4, 4.9), "2.5 m deeper"),
+        ((4.0, 3.0, 1.0), "2.0 m higher"),
+        ((2.0, 2.4, 3.0), ""),
+        ((2.0, 5.0, 3.5), ""),  # between the others
+        ((2.0, 2.4, math.nan), ""),
+        ((math.nan, math.nan, 9.0), ""),
+    ],
+)
+def test_of_a_vehicle_at_another_depth_it_is_told(depths_m, expected) -> None:
+    depths = {f"auv_{i}": depth_m for i, depth_m in enumerate(depths_m, start=1)}
+    (finding,) = offline.left_out(missions.outcome(), depths)
+    assert ("may meet other walls" in finding.sentence) == bool(expected)
+    assert expected in finding.sentence
 
 
 def test_no_sonar_is_no_map(mission, tmp_path, capsys) -> None:

@@ -8,7 +8,7 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from uw_dslam_ros2.cli.common import parser_for, progress_bar, run_command, versions
@@ -36,6 +36,7 @@ __all__ = ["about_fixes", "left_out", "main"]
 
 _MAX_SHARE_ASIDE = 0.05
 """Of fixes, that are set aside without a warning: acoustic ones have such outliers."""
+_OTHER_DEPTH_M = 1.0  # a sonar's beam is about as high, a few metres away
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -157,7 +158,7 @@ def _run(args: argparse.Namespace) -> int:
     give_back()
 
     outcome = dataclasses.replace(outcome_of(queue), unmapped=tuple(unmapped))
-    findings += left_out(outcome)
+    findings += left_out(outcome, {made.vehicle_id: made.depth_m for made in mapped})
     if args.fixes is not None:
         findings += about_fixes(outcome.georeference or queue.why_no_georeference())
     save_session(args.out / SESSION_FOLDER, queue)  # for view, and to go on from
@@ -193,8 +194,14 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def left_out(outcome: Outcome) -> list[Finding]:
-    """What of the vehicles has no place in the common map."""
+def left_out(outcome: Outcome, depths_m: Mapping[str, float] | None = None) -> list[Finding]:
+    """What of the vehicles has no place in the common map.
+
+    `depths_m` is how deep each was for most of the time, NaN where that is not known.
+    """
+    depths_m = depths_m or {}
+    merged = [v.vehicle_id for v in outcome.vehicles if v.is_merged]
+    common_m = [depths_m[v] for v in merged if math.isfinite(depths_m.get(v, math.nan))]
     found = []
     for vehicle in outcome.vehicles:
         num_left = vehicle.num_submaps - vehicle.num_merged
@@ -206,11 +213,22 @@ def left_out(outcome: Outcome) -> list[Finding]:
                 "partly_merged" if vehicle.is_merged else "not_merged",
                 "",
                 f"{what} no place in the common map, for no registration is sure enough "
-                f"({vehicle.reason}); does its sonar see walls that others see?",
+                f"({vehicle.reason}); does its sonar see walls that others see?"
+                + _at_another_depth(depths_m.get(vehicle.vehicle_id, math.nan), common_m),
                 vehicle_id=vehicle.vehicle_id,
             )
         )
     return found
+
+
+def _at_another_depth(depth_m: float, common_m: Sequence[float]) -> str:
+    """What to add of a vehicle that dives above or below all of those that have a common map."""
+    apart_m = [depth_m - other for other in common_m]
+    nearest_m = min(apart_m, key=abs, default=0.0)
+    if not abs(nearest_m) >= _OTHER_DEPTH_M or min(apart_m) * max(apart_m) < 0.0:
+        return ""
+    side = "deeper" if nearest_m > 0.0 else "higher"
+    return f" It dives {abs(nearest_m):.1f} m {side} than they do, and may meet other walls there"
 
 
 def about_fixes(found: Georeference | str) -> list[Finding]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import multiprocessing
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -38,7 +40,7 @@ from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.examining import mended
 from uw_dslam_ros2.io.feeding import feed_runs, in_stamp_order
 from uw_dslam_ros2.io.mountings import role_of
-from uw_dslam_ros2.io.readings import FixEvent
+from uw_dslam_ros2.io.readings import DepthEvent, FixEvent
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import VehicleRecording
@@ -109,6 +111,8 @@ class VehicleSubmaps:
     fixes: tuple[FixEvent, ...] = ()
     """Positions on earth that it was told, in order of time; nothing of the map is made of them.
     """
+    depth_m: float = math.nan
+    """Median of its depths, NaN where it has none."""
 
 
 def map_recordings(
@@ -197,6 +201,7 @@ def map_recording(
     run_ids, kept = itertools.count(1), KeptPings()
     newest: dict[SubmapId, Submap] = {}
     fixes: list[FixEvent] = []
+    depths_m: list[float] = []
     number = 0
     has_yaw = has_yaw_rate = False
     first_ns: int | None = None
@@ -218,6 +223,8 @@ def map_recording(
             if isinstance(event, FixEvent):
                 fixes.append(event)
                 continue
+            if isinstance(event, DepthEvent) and math.isfinite(event.depth_m):
+                depths_m.append(event.depth_m)
             first_ns = event.stamp_ns if first_ns is None else first_ns
             if isinstance(event, ImuEvent):
                 late_s = (event.stamp_ns - first_ns) * 1e-9
@@ -272,6 +279,7 @@ def map_recording(
         ),
         kept.of_submap,
         tuple(fixes),
+        statistics.median(depths_m) if depths_m else math.nan,
     )
 
 

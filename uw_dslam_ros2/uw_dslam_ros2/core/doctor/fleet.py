@@ -96,8 +96,8 @@ def _with_sound_speed(
         )
     else:
         detail = (
-            f"its ranges are taken {per_cent:.1f} % shorter, as those of other vehicles in the "
-            f"same water, whose speed of sound is too high for it ({mend})"
+            f"its ranges are {per_cent:.1f} % too long, as those of other vehicles in the same "
+            f"water, whose speed of sound is too high for it ({mend})"
         )
     finding = Finding(_SOUND_SPEED, "sonar", detail, 1.0, vehicle_id=examined.vehicle_id)
     others = [f for f in examined.findings if f is not told]
