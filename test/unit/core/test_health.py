@@ -81,6 +81,11 @@ def test_a_filter_of_its_own_needs_no_imu_and_no_dvl():
     assert found(sensors=sensors, has_yaw=False, has_yaw_rate=False) == []
 
 
+def test_an_odometry_that_says_nothing_replaces_no_dvl():
+    sensors = without("velocity") | {"odometry": SensorCount(600, num_empty=600)}
+    assert found(sensors=sensors) == [("empty_odometry", "odometry"), ("no_velocity", "velocity")]
+
+
 def test_nothing_mapped_is_an_error_that_says_why():
     counts = {"num_submaps": 0}
     *_, last = health_findings(replace(GOOD, sensors=without("sonar"), counts=counts))

@@ -34,6 +34,11 @@ class SensorCount:
     num_empty: int = 0
     problem: str = ""
 
+    @property
+    def num_useful(self) -> int:
+        """Those that said something."""
+        return self.num - self.num_bad - self.num_empty
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedVehicle:
@@ -107,7 +112,15 @@ def _check_sensors(vehicle: MappedVehicle, tell: _Tell) -> None:
     if not sensors.get("sonar", SensorCount(0)).num:
         tell("no_sonar", "sonar", "there is no topic with a sonar's messages")
     has_heading = vehicle.has_yaw or vehicle.has_yaw_rate
-    if "odometry" not in sensors:
+    odometry = sensors.get("odometry")
+    if odometry is not None and odometry.num >= _MANY and not odometry.num_useful:
+        tell(
+            "empty_odometry",
+            "odometry",
+            f"none of its {odometry.num} messages has a pose or a velocity",
+        )
+        odometry = None
+    if odometry is None:
         if "imu" not in sensors:
             tell(
                 "no_heading",
@@ -134,12 +147,11 @@ def _check_sensors(vehicle: MappedVehicle, tell: _Tell) -> None:
                 f"{count.num_bad} of {count.num} messages are malformed and left out; "
                 f"the first: {count.problem}",
             )
-        useful = count.num - count.num_bad - count.num_empty
-        if role == "velocity" and count.num >= _MANY and useful < _MOST * count.num:
+        if role == "velocity" and count.num >= _MANY and count.num_useful < _MOST * count.num:
             tell(
                 "no_bottom_lock",
                 role,
-                f"only {useful} of {count.num} messages hold a velocity over ground",
+                f"only {count.num_useful} of {count.num} messages hold a velocity over ground",
             )
 
 

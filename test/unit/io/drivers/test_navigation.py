@@ -10,7 +10,7 @@ from unit.io.drivers.messages import STAMP_NS, header, pose, quaternion, vector
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.io.drivers import ADAPTERS, ReadSettings, adapter_of
-from uw_dslam_ros2.io.readings import DepthEvent, FixEvent, PoseEvent
+from uw_dslam_ros2.io.readings import DepthEvent, FixEvent, PoseEvent, VelocityEvent
 
 SETTINGS = ReadSettings(vehicle_id="auv_1")
 NAN = math.nan
@@ -334,11 +334,20 @@ def test_odometry_is_a_pose_with_a_velocity():
     (event,) = read(ODOMETRY, odometry(diagonal=[0] * 6, velocity=(0, 0, 0), x=1.0))
     assert (event.covariance, event.velocity_m_s) == (None, None)
     assert read(ODOMETRY, odometry(x=NAN)) == ()
-    assert read(ODOMETRY, odometry()) == ()  # a pose that nobody filled in
+    assert read(ODOMETRY, odometry(velocity=(0, 0, 0))) == ()  # nobody filled anything in
     bad = odometry(x=1.0)
     bad.pose.pose.orientation = quaternion(0, 0, 0, 0)
     with pytest.raises(InvalidInputError, match="quaternion"):
         read(ODOMETRY, bad)
+
+
+def test_odometry_whose_pose_nobody_filled_in_is_a_velocity():
+    (event,) = read(ODOMETRY, odometry())
+    assert isinstance(event, VelocityEvent)
+    assert (event.frame_id, event.is_z_down, event.covariance) == ("base_link", False, None)
+    assert event.velocity_m_s.tolist() == [1.0, 0.25, 0.0]
+    assert read(ODOMETRY, odometry(x=NAN)) == ()  # lost, not left out
+    assert read(ODOMETRY, odometry(velocity=(NAN, 0.0, 0.0))) == ()
 
 
 def test_the_same_type_as_depth_or_fix():

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.mounting import rotation_of_quaternion
 from uw_dslam_ros2.core.se2 import SE2
-from uw_dslam_ros2.io.drivers.adapter import Adapter, key_of, vector_of
+from uw_dslam_ros2.io.drivers.adapter import Adapter, covariance_or_none, key_of, vector_of
 from uw_dslam_ros2.io.drivers.settings import ReadSettings
-from uw_dslam_ros2.io.readings import DepthEvent, FixEvent, PoseEvent, Reading
+from uw_dslam_ros2.io.readings import DepthEvent, FixEvent, PoseEvent, Reading, VelocityEvent
 
 __all__ = ["ADAPTERS", "planar_pose", "read_odometry", "read_pose", "read_pose_with_covariance"]
 
@@ -24,20 +24,24 @@ _XY_YAW = np.ix_([0, 1, 5], [0, 1, 5])
 
 
 def read_odometry(msg: Any, settings: ReadSettings) -> Sequence[Reading]:
-    """Pose and velocity of an ``Odometry``, or its depth where that is the role."""
+    """Pose and velocity of an ``Odometry``, or its depth where that is the role.
+
+    Drivers of DVLs send it for its twist alone: that is a velocity.
+    """
     readings = _readings(msg, msg.pose.pose, msg.pose.covariance, settings)
+    if settings.role in ("depth", "fix"):
+        return readings
+    velocity = vector_of(msg.twist.twist.linear)
+    is_filled = bool(np.isfinite(velocity).all() and velocity.any())
+    frame_id = str(msg.child_frame_id)
     if readings and isinstance(readings[0], PoseEvent):
-        velocity = vector_of(msg.twist.twist.linear)
-        is_filled = np.isfinite(velocity).all() and velocity.any()
-        pose = readings[0]
-        return (
-            replace(
-                pose,
-                child_frame_id=str(msg.child_frame_id),
-                velocity_m_s=velocity if is_filled else None,
-            ),
-        )
-    return readings
+        known = velocity if is_filled else None
+        return (replace(readings[0], child_frame_id=frame_id, velocity_m_s=known),)
+    if not is_filled or not _is_unset(msg.pose.pose, vector_of(msg.pose.pose.position)):
+        return readings
+    vehicle_id, stamp_ns, _ = key_of(msg, settings)
+    covariance = covariance_or_none(msg.twist.covariance, 6)
+    return (VelocityEvent(vehicle_id, stamp_ns, frame_id, velocity, covariance),)
 
 
 def read_pose(msg: Any, settings: ReadSettings) -> Sequence[Reading]:
@@ -70,7 +74,7 @@ def _readings(
 
 
 def _is_unset(pose: Any, position: FloatArray) -> bool:
-    """Whether nobody filled a pose in: drivers of DVLs send odometry for its twist alone."""
+    """Whether nobody filled a pose in."""
     q = pose.orientation
     return not position.any() and not any((q.x, q.y, q.z)) and q.w in (0.0, 1.0)
 
