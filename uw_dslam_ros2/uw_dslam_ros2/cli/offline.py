@@ -16,12 +16,12 @@ from uw_dslam_ros2.cli.reporting.outcome import Outcome, outcome_of
 from uw_dslam_ros2.cli.reporting.report import RunFacts, headline, write_report
 from uw_dslam_ros2.cli.reporting.scoring import Truth, read_truth
 from uw_dslam_ros2.cli.running.charting import charted
-from uw_dslam_ros2.cli.running.heap import give_back, keep_apart
 from uw_dslam_ros2.cli.running.mapping import OfflineConfig, map_recordings, sensor_config, settle
 from uw_dslam_ros2.core.errors import ConfigError, DataError, NothingMappedError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.merging import Decision, Georeference, MapQueue
 from uw_dslam_ros2.io.fixes import fixes_of_recordings
+from uw_dslam_ros2.io.heap import give_back, keep_apart
 from uw_dslam_ros2.io.sensor_settings import SensorConfig, TopicsConfig
 from uw_dslam_ros2.io.sessions.session import (
     SESSION_FOLDER,

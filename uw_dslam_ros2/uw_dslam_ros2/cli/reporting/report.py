@@ -17,10 +17,10 @@ from uw_dslam_ros2.cli.reporting.link_report import known_over_time
 from uw_dslam_ros2.cli.reporting.outcome import Outcome, json_bytes, write_outcome
 from uw_dslam_ros2.cli.reporting.scoring import Scores, Truth, score
 from uw_dslam_ros2.cli.reporting.wall_lines import walls_of, walls_picture
-from uw_dslam_ros2.cli.running.heap import give_back
 from uw_dslam_ros2.core.merging import Georeference
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
+from uw_dslam_ros2.io.heap import give_back
 from uw_dslam_ros2.io.maps.provenance import contradictions_png
 from uw_dslam_ros2.io.maps.walls import dxf_bytes, walls_geojson_bytes
 from uw_dslam_ros2.view.pairs import KEY

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="its m
 _START = """
 import resource
 import numpy as np
-from uw_dslam_ros2.cli.running.heap import give_back, keep_apart
+from uw_dslam_ros2.io.heap import give_back, keep_apart
 
 def resident_mb():
     with open("/proc/self/statm") as file:
