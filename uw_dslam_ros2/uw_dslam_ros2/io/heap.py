@@ -10,7 +10,7 @@ import ctypes
 import functools
 import gc
 
-__all__ = ["give_back", "keep_apart"]
+__all__ = ["give_back", "keep_apart", "trim"]
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # as in malloc.h
 
@@ -31,6 +31,11 @@ def keep_apart() -> None:
 def give_back() -> None:
     """Return to the system what nobody uses any more, also between smaller things."""
     gc.collect()
+    trim()
+
+
+def trim() -> None:
+    """Return to the system what is free already; takes milliseconds."""
     libc = _libc()
     if libc is not None:
         libc.malloc_trim(0)

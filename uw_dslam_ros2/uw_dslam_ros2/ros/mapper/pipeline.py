@@ -10,6 +10,7 @@ from uw_dslam_ros2.core.mapping import RunBreak, VehicleMapper, VehicleMapperCon
 from uw_dslam_ros2.core.submap import MAX_RUN_ID, Submap
 from uw_dslam_ros2.io.conventions import CorrectedMountings
 from uw_dslam_ros2.io.feeding import SensorEvent, feed_runs
+from uw_dslam_ros2.io.heap import trim
 from uw_dslam_ros2.io.mountings import Mountings
 from uw_dslam_ros2.io.readings import PINGS, TransformEvent
 from uw_dslam_ros2.ros.mapper.convention_watch import ConventionWatch
@@ -259,6 +260,8 @@ class MapperPipeline:
         """Give submaps away; a process that is killed in between has kept them."""
         self._keeper.keep(submaps, self._last_pass.pings.of_submap)
         self._outputs.publish_submaps(submaps)
+        if submaps:
+            trim()  # to look for loops takes a hundred megabytes for a moment
 
 
 def _reorder_s(config: SonarMapperConfig) -> float:
