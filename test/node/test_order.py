@@ -44,6 +44,7 @@ def messages():
 ORDERS = {
     "in turn": (0, 2, 4, 1, 3, 5, 6),
     "backwards, and some twice": (6, 5, 4, 4, 3, 2, 6, 1, 0, 3),
+    "the first one when all others are joined": (2, 4, 1, 3, 5, 6, 0),
 }
 
 
@@ -71,24 +72,28 @@ def settled_map(context, spinning, order, folder):
             infos = statuses[-1].submaps if statuses else []
             return {(info.vehicle_id, info.sequence): info for info in infos}
 
+        def is_settled(begun):
+            last = statuses[max(begun, len(statuses) - 4) :]
+            is_quiet = len(last) == 4 and not any(status.num_in_flight for status in last)
+            return is_quiet and len({status.num_registrations for status in last}) == 1
+
+        def settle():
+            call(Trigger, "settle")
+            begun = len(statuses)
+            until(lambda: is_settled(begun), "all answers", 120.0)
+
         until(lambda: all(p.get_subscription_count() for p in publishers.values()), "the manager")
         seen = set()
-        for index in order:
+        for count, index in enumerate(order):
+            if count == len(order) - 1:
+                settle()
             submap = messages()[index]
             publishers[submap.vehicle_id].publish(submap_to_msg(submap))
             seen.add((submap.vehicle_id, submap.sequence))
             # One after the other, so that the order is the one that is meant.
             until(lambda: seen <= set(newest()), f"{submap.vehicle_id}/{submap.sequence}")
         until(lambda: newest()["auv_2", 0].revision == 1, "the revision")
-        call(Trigger, "settle")
-        begun = len(statuses)
-
-        def is_settled():
-            last = statuses[max(begun, len(statuses) - 4) :]
-            is_quiet = len(last) == 4 and not any(status.num_in_flight for status in last)
-            return is_quiet and len({status.num_registrations for status in last}) == 1
-
-        until(is_settled, "all answers", 120.0)
+        settle()
         assert all(info.state == info.MERGED for info in newest().values())
         assert call(SaveMap, "save_map", path=str(folder / "map")).files
         places = {
