@@ -1,8 +1,11 @@
 """Paths are bent until pings agree on walls, and no further."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from uw_dslam_ros2.core.chart.reckoning import follows
 from uw_dslam_ros2.core.chart.refine import Track, range_scales, refine_tracks
 from uw_dslam_ros2.core.metrics import align_points
 from uw_dslam_ros2.core.se2 import SE2
@@ -136,3 +139,61 @@ def test_a_path_bends_where_navigation_was_silent():
         (found,) = refine_tracks([track], 0.05, 0.8)
         errors.append(error_m([found.poses], [true]))
     assert errors[1] < 0.6 * errors[0]
+
+
+def reckoned(true, rng, scale=1.0, drift_rad_s=0.0):
+    """The path as a log and a gyro say it, in a frame of their own, a ping a second."""
+    times_s = np.arange(len(true), dtype=float)
+    turned = np.diff(true[:, :2], axis=0)
+    angle = 0.7 + drift_rad_s * (times_s[1:] + times_s[:-1]) / 2.0
+    steps = scale * np.column_stack([
+        np.cos(angle) * turned[:, 0] - np.sin(angle) * turned[:, 1],
+        np.sin(angle) * turned[:, 0] + np.cos(angle) * turned[:, 1],
+    ])  # fmt: skip
+    steps += rng.normal(0.0, 0.002, steps.shape)
+    xy = np.cumsum(np.vstack([[3.0, -2.0], steps]), axis=0)
+    return times_s, np.column_stack([xy, true[:, 2] + 0.7 + drift_rad_s * times_s])
+
+
+def with_reckoning(true, rng, ranges=1.0, **wrong):
+    times_s, dead = reckoned(true, rng, **wrong)
+    echoes = [ranges * echoes_of_room(q, rng) for q in true]
+    return Track(drifted(true, rng), echoes, 1.0, None, times_s, dead)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_dead_reckoning_is_held_on_to_but_for_its_constants(seed):
+    rng = np.random.default_rng(seed)
+    true = [there_and_back(7.0), there_and_back(13.0)]
+    tracks = [with_reckoning(p, rng, scale=s, drift_rad_s=d)
+              for p, s, d in zip(true, (1.006, 0.995), (1e-4, -8e-5), strict=True)]  # fmt: skip
+    alone = [dataclasses.replace(track, dead=None) for track in tracks]
+    found, without = refine_tracks(tracks, 0.05, 0.8), refine_tracks(alone, 0.05, 0.8)
+    assert error_m([f.poses for f in found], true) < 0.03
+    assert error_m([f.poses for f in found], true) < error_m([f.poses for f in without], true)
+
+
+def test_speeds_of_sound_that_differ_are_told_from_one_another():
+    """Which one is right only the instruments' own precision says."""
+    rng = np.random.default_rng(6)
+    true = [there_and_back(7.0), there_and_back(13.0)]
+    tracks = [with_reckoning(true[0], rng, 1.004), with_reckoning(true[1], rng, 0.998)]
+    first, second = refine_tracks(tracks, 0.05, 0.8)
+    assert second.range_scale / first.range_scale == pytest.approx(1.004 / 0.998, abs=0.001)
+    # Drawn as large as the mean says, not as small as makes echoes lie nearest to their walls.
+    assert first.range_scale == pytest.approx(1.0 / 1.004, abs=0.003)
+
+
+def test_dead_reckoning_that_is_far_from_the_path_is_left_alone():
+    rng = np.random.default_rng(8)
+    true = there_and_back(8.0)
+    track = with_reckoning(true, rng)
+    lost = track.dead + np.column_stack([np.linspace(0.0, 6.0, len(true)) ** 2 / 12.0] * 3)
+    of_bad_log = track.dead * [0.92, 0.92, 1.0]
+    assert follows(track.dead, track.times_s, track.poses) == pytest.approx((0.0, 1.0), abs=0.2)
+    assert follows(lost, track.times_s, track.poses)[0] > 0.2
+    assert follows(of_bad_log, track.times_s, track.poses)[1] == pytest.approx(1.087, abs=0.02)
+    (without,) = refine_tracks([dataclasses.replace(track, dead=None)], 0.05, 0.8)
+    for dead in (lost, of_bad_log):
+        (found,) = refine_tracks([dataclasses.replace(track, dead=dead)], 0.05, 0.8)
+        np.testing.assert_array_equal(found.poses, without.poses)

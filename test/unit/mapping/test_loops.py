@@ -45,7 +45,7 @@ def section(segments, start, rng):
         found = detections_from_scan(
             i * S, BEARINGS, ranges, 25.0, SonarConfig(neighbor_distance_m=0.0)
         )
-        opened.add(found, T_submap_base, SE2())
+        opened.add(found, T_submap_base, SE2(), T_submap_base)
     return opened.close(SE2(), np.diag([1e-4, 1e-4, 1e-6]))
 
 

@@ -72,8 +72,8 @@ def mission(duration_s=120, scale=1.08, seed=0):
     return events, np.array(truth)
 
 
-def run(config, events):
-    mapper, submaps = VehicleMapper(config, "auv_1"), []
+def run(config, events, watch=None):
+    mapper, submaps = VehicleMapper(config, "auv_1", watch=watch), []
     for kind, t, value in events:
         if kind == "yaw":
             mapper.add_imu(t, value, None)
@@ -101,6 +101,20 @@ def recording():
 @pytest.fixture(scope="module")
 def mapped(recording):
     return run(CONFIG, recording[0])
+
+
+def test_dead_reckoning_is_kept_as_if_no_ping_had_been_matched(recording):
+    def heard(estimator):
+        kept = []
+        config = replace(CONFIG, estimator=estimator)
+        mapper, _ = run(config, recording[0][:600], lambda *what: kept.append(what))
+        placed = {s.submap_id: s.T_odom_submap for s in mapper.submaps()}
+        path = [placed[submap_id] @ T_submap_sonar for submap_id, _, T_submap_sonar, _ in kept]
+        return np.array([T.as_array() for T in path]), np.array([k[3].as_array() for k in kept])
+
+    (matched, dead), (_, of_blind) = heard("scan_matching"), heard("dead_reckoning")
+    np.testing.assert_allclose(dead, of_blind, atol=1e-9)
+    assert np.abs(matched - dead)[:, :2].max() > 0.1
 
 
 def test_matching_and_loops_beat_dead_reckoning(recording, mapped):

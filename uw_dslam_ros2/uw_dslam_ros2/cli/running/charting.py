@@ -47,8 +47,8 @@ def charted(
         return outcome
     if tell is not None:
         for track, pings_of_track in after.items():
-            if pings_of_track.range_scale != 1.0:
-                tell(_too_long(track.vehicle_id, pings_of_track.range_scale))
+            if pings_of_track.told_scale != 1.0:
+                tell(_too_long(track.vehicle_id, pings_of_track.told_scale))
     resolution_m = outcome.global_map.spec.resolution_m
     config = dataclasses.replace(config, resolution_m=resolution_m)
     try:

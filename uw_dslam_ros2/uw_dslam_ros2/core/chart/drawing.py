@@ -46,7 +46,8 @@ class PingTrack:
 
     Ranges are drawn times ``range_scale``. ``drift`` (K, 2) are standard deviations of what the
     path [m] and its heading [rad] gain on one metre there; ``mounting_rad`` is the turn of the
-    sonar on its vehicle that is in the poses but not in the recording.
+    sonar on its vehicle that is in the poses but not in the recording. ``told_scale`` is that part
+    of ``range_scale`` by which ranges are surely too long.
     """
 
     pings: Sequence[DrawnPing]
@@ -54,6 +55,7 @@ class PingTrack:
     drift: FloatArray | None = None
     range_scale: float = 1.0
     mounting_rad: float = 0.0
+    told_scale: float = 1.0
 
     def __post_init__(self) -> None:
         expected = (len(self.pings), 3)
@@ -67,11 +69,29 @@ class PingTrack:
         """Time of each ping (K,)."""
         return np.array([ping.stamp_ns for ping in self.pings], dtype=np.int64)
 
+    @property
+    def times_s(self) -> FloatArray:
+        """Since the first ping (K,)."""
+        return np.asarray((self.stamps_ns - self.stamps_ns[:1]) * 1e-9, np.float64)
+
+    @property
+    def dead_reckoning(self) -> FloatArray | None:
+        """Poses of the sonar (K, 3) by navigation alone; None unless all are known."""
+        poses = [ping.T_dead_sonar for ping in self.pings if ping.T_dead_sonar is not None]
+        if len(poses) < max(2, len(self.pings)):
+            return None
+        return np.array([pose.as_array() for pose in poses])
+
 
 def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]:
     """The same pings where all of them see the same walls; see `refine_tracks`."""
     block_m = _BLOCK_M + _BLOCK_CELLS * resolution_m
-    paths = [Track(t.T_map_sonar, [p.points for p in t.pings], drift=t.drift) for t in tracks]
+    paths = [
+        Track(
+            t.T_map_sonar, [p.points for p in t.pings], 1.0, t.drift, t.times_s, t.dead_reckoning
+        )
+        for t in tracks
+    ]
     scales = range_scales(paths, resolution_m, block_m)
     scaled = [
         dataclasses.replace(path, range_scale=scale)
@@ -82,7 +102,8 @@ def refined(tracks: Sequence[PingTrack], resolution_m: float) -> list[PingTrack]
         dataclasses.replace(
             track,
             T_map_sonar=np.round(path.poses, _ROUNDED),
-            range_scale=round(scale, _ROUNDED),
+            range_scale=round(scale * path.range_scale, _ROUNDED),
+            told_scale=round(scale, _ROUNDED),
             mounting_rad=round(path.mounting_rad, _ROUNDED),
         )
         for track, path, scale in zip(tracks, found, scales, strict=True)

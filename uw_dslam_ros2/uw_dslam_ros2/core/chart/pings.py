@@ -15,8 +15,8 @@ from uw_dslam_ros2.core.submap import SubmapId
 __all__ = ["DrawnPing", "KeptPings", "pack_ping"]
 
 Float32Array = NDArray[np.float32]
-_OBJECT_BYTES = 700
-"""Of a ping without its numbers: its own object, its pose, and three arrays' heads."""
+_OBJECT_BYTES = 850
+"""Of a ping without its numbers: its own object, its poses, and three arrays' heads."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,7 +24,8 @@ class DrawnPing:
     """Echoes and free water of one ping, and where in its submap it was heard.
 
     In single precision, and pings of one sonar share their bearings: what is kept of a ping is
-    its echoes, not its image. Fields are those of `Detections`.
+    its echoes, not its image. Fields are those of `Detections`. ``T_dead_sonar`` is where the
+    sonar was by dead reckoning alone, in a frame that drifts; None where that is not known.
     """
 
     stamp_ns: int
@@ -35,6 +36,7 @@ class DrawnPing:
     free_range_m: Float32Array
     beamwidth_rad: float
     range_sigma_m: float
+    T_dead_sonar: SE2 | None = None
 
     def num_bytes_after(self, before: DrawnPing | None) -> int:
         """Memory that it takes, beside the ping before it."""
@@ -60,7 +62,10 @@ class DrawnPing:
 
 
 def pack_ping(
-    detections: Detections, T_submap_sonar: SE2, before: DrawnPing | None = None
+    detections: Detections,
+    T_submap_sonar: SE2,
+    before: DrawnPing | None = None,
+    T_dead_sonar: SE2 | None = None,
 ) -> DrawnPing:
     """Keep a ping; `before` is the one before it, whose bearings may be the same."""
     bearing_rad = detections.bearing_rad
@@ -75,6 +80,7 @@ def pack_ping(
         detections.free_range_m.astype(np.float32),
         detections.beamwidth_rad,
         detections.range_sigma_m,
+        T_dead_sonar,
     )
 
 
@@ -93,11 +99,18 @@ class KeptPings:
         self._max_bytes = max_bytes
         self._last: DrawnPing | None = None
 
-    def __call__(self, submap_id: SubmapId, detections: Detections, T_submap_sonar: SE2) -> None:
+    def __call__(
+        self,
+        submap_id: SubmapId,
+        detections: Detections,
+        T_submap_sonar: SE2,
+        T_dead_sonar: SE2,
+    ) -> None:
         """Keep one ping."""
         if self.num_bytes >= self._max_bytes:
             self.num_left_out += 1
             return
-        last, self._last = self._last, pack_ping(detections, T_submap_sonar, self._last)
+        packed = pack_ping(detections, T_submap_sonar, self._last, T_dead_sonar)
+        last, self._last = self._last, packed
         self.num_bytes += self._last.num_bytes_after(last)
         self.of_submap.setdefault(submap_id, []).append(self._last)

@@ -49,7 +49,7 @@ class VehicleMapper(VehicleNavigation):
     same is put where it belongs, for the pings that follow; a ping that is late, or earlier than
     all navigation, is left out and counted. The odom frame begins where the vehicle does. A mapper
     is one run (`core.submap.Track`): who begins again makes a new one, with another ``run_id``.
-    ``watch`` is called with all that enters a submap's grid, and its ``T_submap_sonar``.
+    ``watch`` is called with all that enters a submap's grid; see `core.mapping.section.Watch`.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class VehicleMapper(VehicleNavigation):
         self._clouds: Clouds[_Cloud] = Clouds()
         self._late_s = 0.0
         # Until it is known what kind of sonar there is.
-        self._navigation.remember(_TURN_MEMORY_S)
+        self._remember(_TURN_MEMORY_S)
 
     # --- sonar in
     # ----------------
@@ -240,7 +240,7 @@ class VehicleMapper(VehicleNavigation):
         is_turn = sweep is not None or detections.is_turn
         self._late_s = max(self._late_s, (newest_ns - detections.stamp_ns) * 1e-9)
         memory_s = _TURN_MEMORY_S if is_turn else min(_TURN_MEMORY_S, 4.0 * self._late_s)
-        self._navigation.remember(memory_s)
+        self._remember(memory_s)
         if self._last_ping_ns is None:
             # Echoes of a fan are as near to each other as its settings say.
             self._suit(detections.beamwidth_rad if is_turn else _FAN_BEAM_RAD)
@@ -307,6 +307,7 @@ class VehicleMapper(VehicleNavigation):
         T_submap_base, covariance = navigation.relative_at(stamp_ns)
         # At the submap's own start the covariance is zero, which may come out as a trace below it.
         sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
+        T_dead_base = self._dead_reckoning.pose_at(stamp_ns)[0]
         assert submaps.growing is not None
         if submaps.growing.should_close(stamp_ns, sigma_m, self.velocity_silence_s(stamp_ns)):
             issued = submaps.close(covariance)
@@ -315,7 +316,7 @@ class VehicleMapper(VehicleNavigation):
             navigation.clone(stamp_ns)
             T_submap_base = SE2()
         if sweep is None:
-            submaps.growing.add(detections, T_submap_base, T_base_sonar)
+            submaps.growing.add(detections, T_submap_base, T_base_sonar, T_dead_base)
         else:
-            submaps.growing.add_sweep(sweep, T_submap_base)
+            submaps.growing.add_sweep(sweep, T_submap_base, T_dead_base)
         return issued

@@ -24,6 +24,8 @@ class VehicleNavigation:
 
     def __init__(self, config: NavigationConfig) -> None:
         self._navigation = NavigationFilter(config)
+        # Matches of pings move the one; what instruments alone say is kept for the last pass.
+        self._dead_reckoning = NavigationFilter(config)
         self._velocity_ns: int | None = None
         self._pose_differences = PoseDifferences()
         self._attitude: tuple[int, FloatArray | None] = (0, None)
@@ -43,9 +45,11 @@ class VehicleNavigation:
         Yaw may have an unknown constant offset.
         """
         if yaw_rate_rad_s is not None:
-            self._navigation.add_yaw_rate(stamp_ns, yaw_rate_rad_s)
+            for navigation in self._filters:
+                navigation.add_yaw_rate(stamp_ns, yaw_rate_rad_s)
         if yaw_rad is not None:
-            self._navigation.add_yaw(stamp_ns, yaw_rad, yaw_sigma_rad)
+            for navigation in self._filters:
+                navigation.add_yaw(stamp_ns, yaw_rad, yaw_sigma_rad)
 
     def add_velocity(
         self,
@@ -55,13 +59,15 @@ class VehicleNavigation:
         T_base_sensor: SE2 = SE2(),
     ) -> None:
         """Velocity (2,) along the instrument's axes (forward, left) with covariance (2, 2)."""
-        self._navigation.add_velocity(stamp_ns, v_body_m_s, covariance, T_base_sensor)
+        for navigation in self._filters:
+            navigation.add_velocity(stamp_ns, v_body_m_s, covariance, T_base_sensor)
         if np.isfinite(np.asarray(v_body_m_s, dtype=np.float64)).all():
             self._velocity_ns = max(stamp_ns, self._velocity_ns or stamp_ns)
 
     def add_pose(self, stamp_ns: int, T_frame_base: SE2) -> None:
         """Pose that the vehicle's own filter gives; only the motion between poses is used."""
-        self._navigation.add_yaw(stamp_ns, T_frame_base.yaw)
+        for navigation in self._filters:
+            navigation.add_yaw(stamp_ns, T_frame_base.yaw)
         if (difference := self._pose_differences.add(stamp_ns, T_frame_base)) is not None:
             self.add_velocity(*difference)
 
@@ -144,6 +150,15 @@ class VehicleNavigation:
             **navigation.counts(),
             **navigation.sensor_errors(),
         }
+
+    @property
+    def _filters(self) -> tuple[NavigationFilter, NavigationFilter]:
+        return self._navigation, self._dead_reckoning
+
+    def _remember(self, span_s: float) -> None:
+        """Know poses for so long; see `NavigationFilter.remember`."""
+        for navigation in self._filters:
+            navigation.remember(span_s)
 
     def _now_ns(self) -> int:
         """Raises `InvalidInputError` before the first navigation message."""
