@@ -21,6 +21,7 @@ _UNITS = {
 }  # fmt: skip
 _RANGE_FACTORS = (0.5, 2.0, 1.0 / 0.3048)
 """Of ranges there and back, or half of them; in feet."""
+_MAX_RANGE_FACTOR = 5.0
 
 
 def is_scale_wrong(fit: VelocityFit) -> bool:
@@ -97,19 +98,24 @@ def judge_scale(result: Examination, fit: VelocityFit, tilt_rad: float = 0.0) ->
 
 
 def _say_unit(result: Examination, scale: float) -> None:
-    name, unit = min(_UNITS.items(), key=lambda item: abs(math.log(scale / item[1])))
-    if _is_near(scale, unit):
+    name, unit = min(_UNITS.items(), key=lambda item: _distance(scale, item[1]))
+    plain = min(_RANGE_FACTORS, key=lambda factor: _distance(scale, factor))
+    is_unit = _distance(scale, unit) < _UNIT_TOLERANCE
+    is_plain = _distance(scale, plain) < _UNIT_TOLERANCE
+    # A DVL measures in some unit; the length of a sonar's range bins is often set by hand.
+    is_dvl = is_unit or not 1.0 / _MAX_RANGE_FACTOR < scale < _MAX_RANGE_FACTOR
+    if is_dvl or (not is_plain and _distance(scale, unit) < 3.0 * _UNIT_TOLERANCE):
+        factor = unit if is_unit else scale
+        said = f": it is in {name}" if is_unit else ", which is no unit"
         result.tell(
             "dvl_unit",
             "velocity",
-            f"its velocity is {1.0 / scale:.3g} times that of the sonar's echoes: it is in {name} "
-            f"(conventions.velocity_scale: {unit:.4g})",
-            velocity_scale=float(f"{unit:.4g}"),
+            f"its velocity is {1.0 / scale:.3g} times that of the sonar's echoes{said} "
+            f"(conventions.velocity_scale: {factor:.4g})",
+            velocity_scale=float(f"{factor:.4g}"),
         )
         return
-    # A DVL measures in some unit; the length of a sonar's range bins is often set by hand.
-    plain = min(_RANGE_FACTORS, key=lambda factor: abs(math.log(scale / factor)))
-    factor = plain if _is_near(scale, plain) else scale
+    factor = plain if is_plain else scale
     result.tell(
         "sonar_range_factor",
         "sonar",
@@ -121,8 +127,8 @@ def _say_unit(result: Examination, scale: float) -> None:
     )
 
 
-def _is_near(scale: float, factor: float) -> bool:
-    return abs(math.log(scale / factor)) < _UNIT_TOLERANCE
+def _distance(scale: float, factor: float) -> float:
+    return abs(math.log(scale / factor))
 
 
 def confidence_in(value: float, sigma: float) -> float:
