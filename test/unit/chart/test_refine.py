@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from uw_dslam_ros2.core.chart.bending import Track
 from uw_dslam_ros2.core.chart.reckoning import follows
-from uw_dslam_ros2.core.chart.refine import Track, range_scales, refine_tracks
+from uw_dslam_ros2.core.chart.refine import range_scales, refine_tracks
 from uw_dslam_ros2.core.metrics import align_points
 from uw_dslam_ros2.core.se2 import SE2
 

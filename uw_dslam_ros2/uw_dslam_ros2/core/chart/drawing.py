@@ -10,12 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.chart.bending import Track
 from uw_dslam_ros2.core.chart.pings import DrawnPing
-from uw_dslam_ros2.core.chart.refine import (
-    Track,
-    range_scales,
-    refine_tracks,
-)
+from uw_dslam_ros2.core.chart.refine import range_scales, refine_tracks
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import MAX_MAP_SIDE, UNKNOWN, GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig

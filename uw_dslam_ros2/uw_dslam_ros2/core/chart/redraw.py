@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from uw_dslam_ros2.core.chart.bending import DRIFT_M, DRIFT_RAD
 from uw_dslam_ros2.core.chart.drawing import SHARE_AGAINST, PingTrack, refined
 from uw_dslam_ros2.core.chart.pings import DrawnPing
-from uw_dslam_ros2.core.chart.refine import DRIFT_M, DRIFT_RAD
 from uw_dslam_ros2.core.mapping.config import OccupancyConfig
 from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
 from uw_dslam_ros2.core.se2 import SE2, compose_poses, wrap_angle
