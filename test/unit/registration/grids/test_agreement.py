@@ -51,6 +51,7 @@ def test_agreement_is_that_of_both_directions(sides, yaw, shift):
     assert found.conflict == conflict / max(seen, 1)
     assert found.residual_cells == pytest.approx(math.sqrt(square / max(near, 1)))
     assert found.inlier_ratio == there[1] / len(source.points)
+    assert found.target_inlier_ratio == back[1] / len(target.points)
 
 
 def test_common_cells_are_those_known_to_both():

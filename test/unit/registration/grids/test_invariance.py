@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from uw_dslam_ros2.core.pose_graph import invert_covariance
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.judging.verdict import decide
-from uw_dslam_ros2.core.registration.grids.register import match_evidence
+from uw_dslam_ros2.core.registration.grids.register import match_evidence, register_grids
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.sim.maps.pairs import make_pair, pair_errors
 from uw_dslam_ros2.sim.maps.variants import VARIANTS, mirrored
@@ -20,7 +21,7 @@ _PAIRS = [
 ]
 _COARSE = "cells twice as large"  # half of the walls' detail is gone: the only change that takes
 _BAR_MOVES = 0.05
-_EXACT = ("a quarter turn of both", "a quarter turn of the source")
+_EXACT = ("a quarter turn of both", "a quarter turn of the source", "exchanged")
 
 
 def _answer(pair):
@@ -57,6 +58,31 @@ def test_a_mirrored_map_is_never_accepted(place):
     kind, overlap, noise, _ = place
     pair = make_pair(kind, overlap, noise, 7100, size_cells=120)
     assert _answer(replace(pair, source=mirrored(pair.source)))[0] is not Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("place", [("lake", 0.7, "noisy"), ("office", 0.5, "clean")])
+def test_exchanged_maps_have_the_inverse_answer(place):
+    pair = make_pair(*place, 7100, size_cells=100)
+    there = register_grids(pair.source, pair.target)
+    back = register_grids(pair.target, pair.source)
+    assert (back.verdict, back.reason, back.probability) == (
+        there.verdict, there.reason, there.probability
+    )  # fmt: skip
+    assert back.T_target_source.as_array() == pytest.approx(
+        there.T_target_source.inverse().as_array(), abs=1e-9
+    )
+    expected = invert_covariance(there.covariance, there.T_target_source)
+    assert back.covariance == pytest.approx(expected, rel=1e-6, abs=1e-12)
+    assert np.array_equal(back.source_points, there.target_points)
+    assert np.array_equal(back.target_points, there.source_points)
+
+
+@pytest.mark.parametrize("name", ["source", "target"])
+def test_what_a_map_lacks_is_said_of_the_right_one(name):
+    pair = make_pair("lake", 0.7, "clean", 7100, size_cells=60)
+    bare = replace(pair.source, values=np.where(pair.source.known, 0, -1).astype(np.int8))
+    maps = {"source": pair.source, "target": pair.source} | {name: bare}
+    assert f"the {name} map has 0 wall cells" in register_grids(**maps).reason
 
 
 def test_a_turned_map_has_its_cells_where_they_were(rng):

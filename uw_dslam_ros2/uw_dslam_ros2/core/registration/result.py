@@ -80,8 +80,9 @@ class RegistrationResult:
     ``T_target_source`` is the best guess even where the verdict refuses it, for logs, pictures and
     votes: callers must look at `is_accepted`. It is None, its covariance and score NaN, where no
     pose was judged: see `refused`. Scores and bounds are in one unit, 1 being a perfect match of
-    all source weight; ``score`` is of ``T_target_source``, the bounds are of the objective's
-    maximum, which may be another pose where evidence speaks against that.
+    all source weight (of maps: of the one with the smaller known area); ``score`` is of
+    ``T_target_source``, the bounds are of the objective's maximum, which may be another pose where
+    evidence speaks against that.
     """
 
     verdict: Verdict

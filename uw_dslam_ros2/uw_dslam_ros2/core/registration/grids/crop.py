@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap, bounds_of
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["crop_to_known", "turn_to_own_axes"]
+__all__ = ["crop_to_known", "precedes", "turn_to_own_axes"]
 
 _WALL_PERCENT = 65
 _LEAST_SHARE = 0.002  # of all known cells: an island with fewer is a speck
@@ -61,6 +61,25 @@ def turn_to_own_axes(occupancy: OccupancyMap) -> OccupancyMap:
         occupancy = _quarter_turned(occupancy)
         forward, left = -left, forward
     return occupancy
+
+
+def precedes(occupancy: OccupancyMap, other: OccupancyMap) -> bool:
+    """Whether a map comes first of two, by what is in them: that of the smaller known area.
+
+    Of the same area, the one with fewer walls; of maps that also have as many of these, bytes
+    decide. Both are told as `turn_to_own_axes` tells them.
+    """
+    return _order(occupancy) < _order(other)
+
+
+def _order(occupancy: OccupancyMap) -> tuple[float, float, tuple[int, int], bytes]:
+    area = occupancy.spec.resolution_m**2
+    # The product is rounded so that cells of another size, which share an area, have the same.
+    known, walls = (
+        round(area * np.count_nonzero(mask), 6)
+        for mask in (occupancy.known, occupancy.values >= _WALL_PERCENT)
+    )
+    return known, walls, occupancy.spec.shape, occupancy.values.tobytes()
 
 
 def _imbalance(mask: NDArray[np.bool_]) -> tuple[int, int]:

@@ -46,15 +46,19 @@ _MOST_SCANNED, _MOST_FINEST = 4.0, 2.0  # times the cells asked for, of a map fa
 
 
 def prepare_maps(
-    source: OccupancyMap, target: OccupancyMap, config: GridRegistrationConfig
+    source: OccupancyMap,
+    target: OccupancyMap,
+    config: GridRegistrationConfig,
+    names: tuple[str, str] = ("source", "target"),
 ) -> tuple[Pyramid, list[Sides]] | str:
     """Problems from coarse to fine, and both maps from fine to coarse; or what a map lacks.
 
-    The finest problem is on the cells of one pair of the maps.
+    ``names`` are what the caller calls the two. The finest problem is on the cells of one pair of
+    the maps.
     """
     resolution_m = _finest_resolution(source, target, config.finest_cells)
     sides = []
-    for name, occupancy in (("source", source), ("target", target)):
+    for name, occupancy in zip(names, (source, target), strict=True):
         cells = clean_cells(occupancy)
         if (fault := _too_little(name, occupancy, cells, config.min_wall_cells)) is not None:
             return fault

@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.features.grid_blocks import shrink_blocks
 from uw_dslam_ros2.core.grid import OccupancyMap
+from uw_dslam_ros2.core.pose_graph import invert_covariance
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
-from uw_dslam_ros2.core.registration.grids.crop import crop_to_known, turn_to_own_axes
+from uw_dslam_ros2.core.registration.grids.crop import (
+    crop_to_known,
+    precedes,
+    turn_to_own_axes,
+)
 from uw_dslam_ros2.core.registration.grids.finding.candidates import merge_best, scan_candidates
 from uw_dslam_ros2.core.registration.grids.finding.frames import GridFrames
 from uw_dslam_ros2.core.registration.grids.finding.search import search_poses
@@ -120,7 +125,12 @@ def match_evidence(
 
 
 class _GridMatch:
-    """One registration; the steps of the recipe in `run`."""
+    """One registration; the steps of the recipe in `run`.
+
+    Which of two maps is laid on which does not depend on which the caller calls the source: here,
+    the source is that which `precedes` the other. A prior window is a box in the target's frame
+    alone, so with one the maps stay as they are.
+    """
 
     def __init__(
         self,
@@ -130,8 +140,13 @@ class _GridMatch:
         prior: PriorWindow | None,
         clock: Clock | None,
     ) -> None:
-        self._source = turn_to_own_axes(crop_to_known(source))
-        self._target = turn_to_own_axes(crop_to_known(target))
+        sides = [turn_to_own_axes(crop_to_known(side)) for side in (source, target)]
+        self._names = ("source", "target")
+        self._is_exchanged = prior is None and precedes(sides[1], sides[0])
+        if self._is_exchanged:
+            sides.reverse()
+            self._names = ("target", "source")
+        self._source, self._target = sides
         self._frames = GridFrames(self._source.spec, self._target.spec)
         self._config, self._prior, self._clock = config, prior, clock
         self._start_s = clock() if clock is not None else math.nan
@@ -143,7 +158,7 @@ class _GridMatch:
         is_cancelled: Callable[[], bool] | None,
     ) -> RegistrationResult:
         """The recipe."""
-        prepared = prepare_maps(self._source, self._target, self._config)
+        prepared = prepare_maps(self._source, self._target, self._config, self._names)
         if isinstance(prepared, str):
             return self._refused(Verdict.TOO_FEW_FEATURES, prepared)
         pyramid, scales = prepared
@@ -173,14 +188,14 @@ class _GridMatch:
 
     def collect(self) -> tuple[MatchEvidence, list[tuple[PoseEvidence, SE2]]] | None:
         """Evidence, and that of each pose by itself; None where a map holds too little."""
-        prepared = prepare_maps(self._source, self._target, self._config)
+        prepared = prepare_maps(self._source, self._target, self._config, self._names)
         if isinstance(prepared, str):
             return None
         pyramid, scales = prepared
         window = self._frames.window(pyramid.scanned, self._prior)
         found = weigh(scales, pyramid, window, *scan_candidates(pyramid, window))
         weighed = (found.evidence.best, *found.evidence.rivals)
-        motions = [self._frames.to_frames(pyramid.finest.motion_of(c.pose)) for c in found.refined]
+        motions = [self._told(pyramid.finest.motion_of(c.pose)) for c in found.refined]
         evidence = self._doubted(found, scales, pyramid, window).evidence
         return evidence, list(zip(weighed, motions, strict=True))
 
@@ -215,7 +230,7 @@ class _GridMatch:
             if progress is not None:
                 T = told.T_target_source
                 motion = problem.motion_of(np.array([T.yaw, T.x, T.y]))
-                progress(replace(told, T_target_source=self._frames.to_frames(motion)))
+                progress(replace(told, T_target_source=self._told(motion)))
 
         outcome = search_poses(
             problem, window, start, SearchSettings(config.gap, num_boxes, left_s),
@@ -244,21 +259,26 @@ class _GridMatch:
         if verdict is Verdict.TOO_FEW_FEATURES:
             return self._refused(verdict, reason)
         motion = self._frames.to_frames(finest.motion_of(pose))
+        covariance = self._frames.covariance(finest, found.spread.covariance, motion)
+        inlier_ratio = agreement.inlier_ratio
+        source_points = self._frames.source_points(work.source_points + work.center, work)
+        target_points = self._frames.target_points(work.target_points, work)
+        if self._is_exchanged:
+            covariance, motion = invert_covariance(covariance, motion), motion.inverse()
+            inlier_ratio = agreement.target_inlier_ratio
+            source_points, target_points = target_points, source_points
         bound = outcome.upper_bound / max(score, 1e-12)
         best_score = max(found.evidence.best.score, 1e-9)
         rivals = tuple(
-            Rival(
-                self._frames.to_frames(finest.motion_of(c.pose)), rival.score / best_score, bound
-            )
+            Rival(self._told(finest.motion_of(c.pose)), rival.score / best_score, bound)
             for c, rival in zip(found.refined[1:], found.evidence.rivals, strict=True)
             if rival.score > _RIVAL_SHARE * best_score or verdict is Verdict.AMBIGUOUS
         )
-        source_points = work.source_points + work.center
         return RegistrationResult(
             verdict=verdict,
             reason=reason,
             T_target_source=motion,
-            covariance=self._frames.covariance(finest, found.spread.covariance, motion),
+            covariance=covariance,
             probability=probability,
             score=score,
             lower_bound=outcome.lower_bound,
@@ -268,13 +288,18 @@ class _GridMatch:
             seconds=self._elapsed(),
             overlap=agreement.overlap,
             conflict_ratio=agreement.conflict,
-            inlier_ratio=agreement.inlier_ratio,
-            num_source_points=len(work.source_points),
-            num_target_points=len(work.target_points),
+            inlier_ratio=inlier_ratio,
+            num_source_points=len(source_points),
+            num_target_points=len(target_points),
             rivals=rivals,
-            source_points=self._frames.source_points(source_points, work),
-            target_points=self._frames.target_points(work.target_points, work),
+            source_points=source_points,
+            target_points=target_points,
         )
+
+    def _told(self, motion: SE2) -> SE2:
+        """Motion between the grids' own axes to ``T_target_source`` as the caller calls them."""
+        told = self._frames.to_frames(motion)
+        return told.inverse() if self._is_exchanged else told
 
     def _elapsed(self) -> float:
         return self._clock() - self._start_s if self._clock is not None else math.nan

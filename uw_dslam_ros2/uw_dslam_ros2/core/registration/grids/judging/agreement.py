@@ -27,7 +27,8 @@ class Agreement:
     ``overlap`` is the area seen by both over the smaller seen area. Of the wall cells of either
     map inside the other's seen area (``num_walls``; of split cells, half), ``agreement`` is
     the share with a wall near and ``conflict`` the share on free space with none near.
-    ``inlier_ratio`` of the source's wall cells have a partner. ``residual_cells`` is the root mean
+    ``inlier_ratio`` of the source's wall cells have a partner, ``target_inlier_ratio`` of the
+    target's. ``residual_cells`` is the root mean
     square distance of the partners. ``wall_share`` is the share of the common area that is that
     near to a wall: what a wall cell dropped anywhere would find. ``num_detail`` of the agreeing
     wall cells lie off the few straight lines that hold most of them: any room has straight walls,
@@ -42,6 +43,7 @@ class Agreement:
     residual_cells: float
     wall_share: float
     num_detail: float
+    target_inlier_ratio: float = 0.0
 
 
 class WallMap:
@@ -80,8 +82,8 @@ _LEAST_FREE = 0.6  # share of free cells around a wall that make it contradict t
 
 def measure_agreement(source: WallMap, target: WallMap, T_target_source: SE2) -> Agreement:
     """Agreement of two maps of one resolution; ``T_target_source`` is in cells [x, y]."""
-    seen, near, conflict, square, inliers = 0, 0, 0, 0.0, 0.0
-    agreeing = []
+    seen, near, conflict, square = 0, 0, 0, 0.0
+    agreeing, inliers = [], []
     for walls, other, T_other in (
         (source, target, T_target_source),
         (target, source, T_target_source.inverse()),
@@ -96,8 +98,7 @@ def measure_agreement(source: WallMap, target: WallMap, T_target_source: SE2) ->
         square += counts[3]
         points = walls.points[is_near]
         agreeing.append(T_target_source.apply(points) if walls is source else points)
-        if walls is source:
-            inliers = counts[1] / max(len(is_near), 1)
+        inliers.append(counts[1] / max(len(is_near), 1))
     overlap, wall_share = _common_area(source, target, T_target_source)
     share, width = 1.0, _LINE_HALF_WIDTH_CELLS
     if source.is_split:
@@ -108,10 +109,11 @@ def measure_agreement(source: WallMap, target: WallMap, T_target_source: SE2) ->
         round(share * seen),
         near / max(seen, 1),
         conflict / max(seen, 1),
-        inliers,
+        inliers[0],
         float(np.sqrt(square / max(near, 1))),
         wall_share,
         share * near * _detail_share(np.concatenate(agreeing), width),
+        inliers[1],
     )
 
 
