@@ -135,12 +135,24 @@ def test_of_two_poses_that_nothing_tells_apart_each_has_half_of_the_probability(
 def test_a_match_that_rivals_all_but_reach_is_less_probable_for_itself():
     """Even where none of them is as convincing: accident has made such poses, too."""
     told = []
-    for agreement, conflict in ((0.6, 0.2), (0.86, 0.1), (0.88, 0.07)):
-        rival = PoseEvidence(_agreement(agreement=agreement, conflict=conflict), 0.4, 3.0)
-        evidence = replace(GOOD, best=replace(GOOD.best, surprise=3.0), rivals=(rival,))
+    for agreement, conflict in ((0.6, 0.2), (0.86, 0.11), (0.86, 0.1)):
+        rival = PoseEvidence(_agreement(agreement=agreement, conflict=conflict), 0.4, 5.0)
+        evidence = replace(GOOD, best=replace(GOOD.best, surprise=6.0), rivals=(rival,))
         assert rival_probability(evidence) < 0.6
         told.append(probability_of(evidence, is_alone=True))
     assert told[0] > told[1] > told[2]
+
+
+def test_a_pose_that_explains_little_is_not_made_sure_by_the_weakness_of_others():
+    """Two parallel walls of two houses: no other pose explains anything at all."""
+    best = PoseEvidence(
+        _agreement(agreement=0.777, conflict=0.175, wall_share=0.195, num_detail=55.0), 0.5, 9.3
+    )
+    alone = replace(GOOD, best=best, rivals=())
+    own = pose_logit(best, alone.log_volume)
+    assert own < 0.0
+    assert probability_of(alone) < 0.75
+    assert probability_of(alone) < 1.0 / (1.0 + math.exp(-(2.1 + 2.0 * own))) + 1e-9
 
 
 def test_what_is_stated_does_not_leap_where_a_verdict_turns():

@@ -95,6 +95,7 @@ ODDS_FEATURES = ("match", "rather_right")
 _RIVAL_SHARES = (0.2, 2.0)  # beyond, a rival's score says no more
 _MOST_MARGIN = 3.0  # logits; beyond, a rival's evidence says no more
 _RATHER_RIGHT = 2.0  # logits above even odds; beyond, the match model is sure
+_OWN_BOUND = (2.1, 2.0)  # on the logit of a match: at even odds of its pose, and its slope
 _MOST_LOGIT = 12.0
 _ONE_OF_TWO = 0.5
 # How often one of two maps has left and right exchanged [logit]: one time in fourteen.
@@ -119,18 +120,18 @@ class VerdictModels:
 
 MODELS = VerdictModels(
     pose=(-1.3292, 1.9783, -20.1197, 0.7012, -4.7006, 2.4299, -0.2288),
-    match=(-1.772, 0.8379, 2.2163, 0.7473),
-    odds=(-0.6474, 0.7933, 2.2199),
+    match=(-1.9433, 0.9233, 2.4792, 0.7057),
+    odds=(-0.466, 0.8627, 1.886),
 )
 """Fitted by the model fit of `study verdict`, each place weighed as one.
 
 The model of a pose is of 1,891 answers: 364 of windows of simulated places, 276 of maps of
 simulated places that were built apart, 1,251 of real maps; the slope of ``log_volume`` is held at
-what windows with and without priors gave before. The model of a match is of 2,755 answers: 1,125
-of simulated places, 360 of them in a mirror and 123 with a prior; 1,630 of real maps, 528 of them
-in a mirror, 288 windows of lidar maps, and 550 pairs of different places. The odds are of 2,884:
-these and more pairs of different places. The real maps are public ones and no part of this
-repository; a list of one's own goes to `--pairs`.
+what windows with and without priors gave before. The model of a match and its odds are of 4,011
+answers: 1,468 of simulated places, 360 of them in a mirror, 123 with a prior, 517 pairs of
+different places; 2,543 of real maps, 528 of them in a mirror, 288 windows of lidar maps, 1,463
+pairs of different places. The real maps are public ones and no part of this repository; a list of
+one's own goes to `--pairs`.
 docs/experiments.md has what other fits would change.
 """
 
@@ -201,9 +202,14 @@ def probability_of(
 ) -> float:
     """Probability in [0, 1] that the best pose is right.
 
+    Where no other pose explains two maps, the best one stands out, also if it explains little: so
+    what speaks for it by itself bounds what its rivals' weakness can say.
+
     ``is_alone`` asks only how convincing it is, and for nothing that explains it otherwise.
     """
-    alone = _share(_logit(models.odds, odds_features(evidence, models)))
+    odds = _logit(models.odds, odds_features(evidence, models))
+    own, slope = pose_logit(evidence.best, evidence.log_volume, models), _OWN_BOUND[1]
+    alone = _share(min(odds, _OWN_BOUND[0] + slope * own))
     if is_alone:
         return alone
     return alone * share_left_by_doubts(evidence, models)
