@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.mapping import (
     VehicleMapper,
     VehicleMapperConfig,
 )
+from uw_dslam_ros2.core.mapping.vehicle_navigation import VehicleNavigation
 from uw_dslam_ros2.core.merging.graph.submap_groups import StoredSubmap
 from uw_dslam_ros2.core.navigation import NavigationConfig
 from uw_dslam_ros2.core.se2 import SE2
@@ -115,6 +116,15 @@ def test_dead_reckoning_is_kept_as_if_no_ping_had_been_matched(recording):
     (matched, dead), (_, of_blind) = heard("scan_matching"), heard("dead_reckoning")
     np.testing.assert_allclose(dead, of_blind, atol=1e-9)
     assert np.abs(matched - dead)[:, :2].max() > 0.1
+
+
+def test_poses_of_the_vehicles_own_filter_are_no_dead_reckoning_to_hold_on_to():
+    navigation = VehicleNavigation(CONFIG.navigation)
+    navigation.add_imu(0, 0.0, 0.0)
+    navigation.add_velocity(0, (1.0, 0.0))
+    assert navigation.dead_reckoning_at(0) is not None
+    navigation.add_pose(100_000_000, SE2())
+    assert navigation.dead_reckoning_at(100_000_000) is None
 
 
 def test_matching_and_loops_beat_dead_reckoning(recording, mapped):

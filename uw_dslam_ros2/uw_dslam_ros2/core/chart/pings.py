@@ -104,7 +104,7 @@ class KeptPings:
         submap_id: SubmapId,
         detections: Detections,
         T_submap_sonar: SE2,
-        T_dead_sonar: SE2,
+        T_dead_sonar: SE2 | None,
     ) -> None:
         """Keep one ping."""
         if self.num_bytes >= self._max_bytes:

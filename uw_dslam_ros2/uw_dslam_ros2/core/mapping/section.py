@@ -22,9 +22,9 @@ from uw_dslam_ros2.core.submap import Submap
 __all__ = ["ClosedSection", "OpenSection"]
 
 FloatArray = NDArray[np.float64]
-Watch = Callable[[Detections, SE2, SE2], None]
+Watch = Callable[[Detections, SE2, SE2 | None], None]
 """Called with all that enters a grid, its ``T_submap_sonar``, and where the sonar was by dead
-reckoning alone, in a frame that drifts."""
+reckoning alone, in a frame that drifts; None where that is not known."""
 
 _BLIND_S, _LEAST_BLIND_S = 60.0, 8.0
 """All of a vehicle that has had no velocity for so long is uncertain at once, and submaps of a few
@@ -124,11 +124,15 @@ class OpenSection:
         return np.array(self._stamps_ns, dtype=np.int64)
 
     def add(
-        self, detections: Detections, T_submap_base: SE2, T_base_sonar: SE2, T_dead_base: SE2
+        self,
+        detections: Detections,
+        T_submap_base: SE2,
+        T_base_sonar: SE2,
+        T_dead_base: SE2 | None,
     ) -> None:
         """Add one ping; it enters the grid only some distance, turn or time after the last.
 
-        ``T_dead_base`` is where the vehicle is by dead reckoning alone.
+        ``T_dead_base`` is where the vehicle is by dead reckoning alone, where that is known.
         """
         stamp_ns = detections.stamp_ns
         self._go_on(stamp_ns, T_submap_base)
@@ -136,22 +140,21 @@ class OpenSection:
         if self._is_due(stamp_ns, T_submap_base):
             self._last_mapped = (stamp_ns, T_submap_base)
             T_submap_sonar = T_submap_base @ T_base_sonar
-            self._draw(detections, T_submap_sonar, T_dead_base @ T_base_sonar)
+            T_dead_sonar = T_dead_base @ T_base_sonar if T_dead_base is not None else None
+            self._draw(detections, T_submap_sonar, T_dead_sonar)
             self._keep(detections, T_submap_sonar, detections.is_turn)
 
     def add_sweep(
-        self, sweep: PlacedSweep, T_submap_reference: SE2, T_dead_reference: SE2
+        self, sweep: PlacedSweep, T_submap_reference: SE2, T_dead_reference: SE2 | None
     ) -> None:
         """Add a sweep of a sonar that turns: all its beams, each from its own place."""
         for stamp_ns, pose in zip(sweep.stamps_ns, sweep.path, strict=True):
             self._go_on(int(stamp_ns), T_submap_reference @ SE2.from_array(pose))
         self.num_pings += 1
         for part in sweep.slices:
-            self._draw(
-                part.detections,
-                T_submap_reference @ part.T_reference_sonar,
-                T_dead_reference @ part.T_reference_sonar,
-            )
+            T_part = part.T_reference_sonar
+            T_dead_sonar = T_dead_reference @ T_part if T_dead_reference is not None else None
+            self._draw(part.detections, T_submap_reference @ T_part, T_dead_sonar)
         self._keep(sweep.detections, T_submap_reference, is_turn=True)
 
     def _go_on(self, stamp_ns: int, T_submap_base: SE2) -> None:
@@ -161,7 +164,7 @@ class OpenSection:
         self._trajectory.append((T_submap_base.x, T_submap_base.y, T_submap_base.yaw))
         self._stamps_ns.append(stamp_ns)
 
-    def _draw(self, detections: Detections, T_submap_sonar: SE2, T_dead_sonar: SE2) -> None:
+    def _draw(self, detections: Detections, T_submap_sonar: SE2, T_dead_sonar: SE2 | None) -> None:
         self.grid.add(detections, T_submap_sonar)
         if self._watch is not None:
             self._watch(detections, T_submap_sonar, T_dead_sonar)

@@ -307,7 +307,7 @@ class VehicleMapper(VehicleNavigation):
         T_submap_base, covariance = navigation.relative_at(stamp_ns)
         # At the submap's own start the covariance is zero, which may come out as a trace below it.
         sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
-        T_dead_base = self._dead_reckoning.pose_at(stamp_ns)[0]
+        T_dead_base = self.dead_reckoning_at(stamp_ns)
         assert submaps.growing is not None
         if submaps.growing.should_close(stamp_ns, sigma_m, self.velocity_silence_s(stamp_ns)):
             issued = submaps.close(covariance)

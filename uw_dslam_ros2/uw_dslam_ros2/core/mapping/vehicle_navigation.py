@@ -26,6 +26,7 @@ class VehicleNavigation:
         self._navigation = NavigationFilter(config)
         # Matches of pings move the one; what instruments alone say is kept for the last pass.
         self._dead_reckoning = NavigationFilter(config)
+        self._has_poses = False
         self._velocity_ns: int | None = None
         self._pose_differences = PoseDifferences()
         self._attitude: tuple[int, FloatArray | None] = (0, None)
@@ -66,6 +67,7 @@ class VehicleNavigation:
 
     def add_pose(self, stamp_ns: int, T_frame_base: SE2) -> None:
         """Pose that the vehicle's own filter gives; only the motion between poses is used."""
+        self._has_poses = True
         for navigation in self._filters:
             navigation.add_yaw(stamp_ns, T_frame_base.yaw)
         if (difference := self._pose_differences.add(stamp_ns, T_frame_base)) is not None:
@@ -122,6 +124,13 @@ class VehicleNavigation:
     def depth_m(self) -> float:
         """Depth below the surface as last measured; NaN where it is not."""
         return self._depth_m
+
+    def dead_reckoning_at(self, stamp_ns: int) -> SE2 | None:
+        """Where the vehicle is by its instruments alone, in a frame that drifts.
+
+        None where its own filter gives poses: what those are wrong by is not a scale and a drift.
+        """
+        return None if self._has_poses else self._dead_reckoning.pose_at(stamp_ns)[0]
 
     def velocity_silence_s(self, stamp_ns: int) -> float:
         """For how long there has been no velocity [s]; infinity before the first."""
