@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,10 +161,10 @@ def _fitted(trials: list[Trial]) -> VerdictModels:
     answers = [trial.is_right for trial in trials]
     most = [share_left_by_doubts(trial.evidence, VerdictModels(pose)) for trial in trials]
     rows = [match_features(trial.evidence, pose) for trial in trials]
-    models = VerdictModels(pose, _logistic(MATCH_FEATURES, rows, answers, trial_weights, most))
-    pairs = [odds_features(trial.evidence, models) for trial in trials]
+    match = _logistic(MATCH_FEATURES, rows, answers, trial_weights, most)
+    pairs = [odds_features(row, match) for row in rows]
     odds = _logistic(ODDS_FEATURES, pairs, answers, trial_weights, most, _ODDS_RIDGE)
-    return replace(models, odds=(odds[0], odds[1], odds[2]))
+    return VerdictModels(pose, match, (odds[0], odds[1], odds[2]))
 
 
 def _logistic(

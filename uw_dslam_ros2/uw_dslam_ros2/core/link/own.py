@@ -143,7 +143,6 @@ class OwnItems:
             self._layers[key] = self.outbox.add(content, rank, key.layer.name.lower())
         elif item.content != content:
             self._layers[key] = self.outbox.replace(item, content)
-            if (
-                self._layers[key] is not item
-            ):  # the others have it where it was: that will do first
+            # Others have it where it was: that will do first.
+            if self._layers[key] is not item:
                 self._layers[key].rank = _MOVED_RANK

@@ -21,7 +21,7 @@ from uw_dslam_ros2.core.submap import Submap, SubmapId, Track
 __all__ = ["MapperWatch", "SubmapChain"]
 
 FloatArray = NDArray[np.float64]
-MapperWatch = Callable[[SubmapId, Detections, SE2, SE2], None]
+MapperWatch = Callable[[SubmapId, Detections, SE2, SE2 | None], None]
 _REISSUE_M, _REISSUE_RAD = 0.02, 0.002
 """A submap that moved by more is given away again."""
 

@@ -25,8 +25,7 @@ class VehicleNavigation:
     def __init__(self, config: NavigationConfig) -> None:
         self._navigation = NavigationFilter(config)
         # Matches of pings move the one; what instruments alone say is kept for the last pass.
-        self._dead_reckoning = NavigationFilter(config)
-        self._has_poses = False
+        self._dead_reckoning: NavigationFilter | None = NavigationFilter(config)
         self._velocity_ns: int | None = None
         self._pose_differences = PoseDifferences()
         self._attitude: tuple[int, FloatArray | None] = (0, None)
@@ -67,7 +66,7 @@ class VehicleNavigation:
 
     def add_pose(self, stamp_ns: int, T_frame_base: SE2) -> None:
         """Pose that the vehicle's own filter gives; only the motion between poses is used."""
-        self._has_poses = True
+        self._dead_reckoning = None  # see `dead_reckoning_at`
         for navigation in self._filters:
             navigation.add_yaw(stamp_ns, T_frame_base.yaw)
         if (difference := self._pose_differences.add(stamp_ns, T_frame_base)) is not None:
@@ -130,7 +129,9 @@ class VehicleNavigation:
 
         None where its own filter gives poses: what those are wrong by is not a scale and a drift.
         """
-        return None if self._has_poses else self._dead_reckoning.pose_at(stamp_ns)[0]
+        if self._dead_reckoning is None:
+            return None
+        return self._dead_reckoning.pose_at(stamp_ns)[0]
 
     def velocity_silence_s(self, stamp_ns: int) -> float:
         """For how long there has been no velocity [s]; infinity before the first."""
@@ -161,7 +162,9 @@ class VehicleNavigation:
         }
 
     @property
-    def _filters(self) -> tuple[NavigationFilter, NavigationFilter]:
+    def _filters(self) -> tuple[NavigationFilter, ...]:
+        if self._dead_reckoning is None:
+            return (self._navigation,)
         return self._navigation, self._dead_reckoning
 
     def _remember(self, span_s: float) -> None:

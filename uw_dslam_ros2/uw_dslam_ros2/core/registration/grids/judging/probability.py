@@ -164,14 +164,16 @@ def match_features(evidence: MatchEvidence, pose_model: Sequence[float]) -> tupl
     return best, lead, min(max(margin, 0.0), _MOST_MARGIN)
 
 
-def odds_features(evidence: MatchEvidence, models: VerdictModels) -> tuple[float, float]:
+def odds_features(features: Sequence[float], match_model: Sequence[float]) -> tuple[float, float]:
     """Logit of the match model, and what of it lies just above even odds, as `ODDS_FEATURES`.
+
+    ``features`` are those of `match_features`.
 
     A logistic model is held back by the few matches that are right though nothing speaks for them:
     those that it thinks rather right than wrong are right far oftener than it says. Where it is
     sure there are too few wrong ones to say more.
     """
-    logit = _logit(models.match, match_features(evidence, models.pose))
+    logit = _logit(match_model, features)
     return logit, min(max(logit, 0.0), _RATHER_RIGHT)
 
 
@@ -207,9 +209,10 @@ def probability_of(
 
     ``is_alone`` asks only how convincing it is, and for nothing that explains it otherwise.
     """
-    odds = _logit(models.odds, odds_features(evidence, models))
-    own, slope = pose_logit(evidence.best, evidence.log_volume, models), _OWN_BOUND[1]
-    alone = _share(min(odds, _OWN_BOUND[0] + slope * own))
+    features = match_features(evidence, models.pose)
+    odds = _logit(models.odds, odds_features(features, models.match))
+    bound, slope = _OWN_BOUND
+    alone = _share(min(odds, bound + slope * features[0]))
     if is_alone:
         return alone
     return alone * share_left_by_doubts(evidence, models)
