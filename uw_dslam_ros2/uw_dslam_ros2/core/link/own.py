@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Iterable
 
 from uw_dslam_ros2.core.errors import InvalidInputError
@@ -15,7 +14,7 @@ from uw_dslam_ros2.core.link.coding.items import (
     read_item,
     read_layer,
 )
-from uw_dslam_ros2.core.link.coding.moves import Move, move_item
+from uw_dslam_ros2.core.link.coding.moves import Move, move_item, moved
 from uw_dslam_ros2.core.link.held import HeldSubmaps
 from uw_dslam_ros2.core.link.transport.outbox import Outbox, OutItem
 from uw_dslam_ros2.core.link.types import OwnState
@@ -71,13 +70,7 @@ class OwnItems:
         held = self._held.own(key)
         if held is None or held.outline is None:
             raise InvalidInputError(f"submap {submap.submap_id} moves before it has come")
-        outline = dataclasses.replace(
-            held.outline,
-            revision=submap.revision,
-            is_final=submap.is_final,
-            T_odom_submap=submap.T_odom_submap,
-            covariance=submap.covariance,
-        )
+        outline = moved(held.outline, submap)
         data = write_outline(outline, self._key)
         if self.outbox.is_confirmed(self._layers[key], peers):
             self._held.take_layer(self._number, key, data)

@@ -14,8 +14,9 @@ from uw_dslam_ros2.core.link.coding.fields import ByteReader, ByteWriter
 from uw_dslam_ros2.core.link.coding.items import ItemKind, LayerKey
 from uw_dslam_ros2.core.link.coding.outline import Outline
 from uw_dslam_ros2.core.se2 import SE2
+from uw_dslam_ros2.core.submap import Submap
 
-__all__ = ["Move", "move_item"]
+__all__ = ["Move", "move_item", "moved"]
 
 _TAG_BYTES = 4
 
@@ -51,15 +52,19 @@ class Move:
 
     def applied(self, outline: Outline, key: bytes) -> bytes | None:
         """The layer of the outline that has moved; None where another one was meant."""
-        moved = dataclasses.replace(
-            outline,
-            revision=self.revision,
-            is_final=self.is_final,
-            T_odom_submap=self.T_odom_submap,
-            covariance=self.covariance,
-        )
-        data = write_outline(moved, key)
+        data = write_outline(moved(outline, self), key)
         return data if data[-_TAG_BYTES:] == self.tag else None
+
+
+def moved(outline: Outline, to: Move | Submap) -> Outline:
+    """An outline with the pose, and what goes with it, of a move or of a submap."""
+    return dataclasses.replace(
+        outline,
+        revision=to.revision,
+        is_final=to.is_final,
+        T_odom_submap=to.T_odom_submap,
+        covariance=to.covariance,
+    )
 
 
 def move_item(key: LayerKey, outline: Outline, data: bytes) -> bytes:

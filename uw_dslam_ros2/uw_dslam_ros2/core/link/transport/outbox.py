@@ -163,7 +163,7 @@ class Outbox:
         """Items of which some peer has not said that it has them."""
         known = list(peers)
         return sum(
-            not item.is_void and any(item.peers.get(p, (1, 0))[0] > 0 for p in known)
+            bool(known) and not item.is_void and not self.is_confirmed(item, known)
             for item in self.items
         )
 
