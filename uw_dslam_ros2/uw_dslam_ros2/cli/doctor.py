@@ -17,20 +17,16 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.cli.common import parser_for, run_command
 from uw_dslam_ros2.cli.reporting.outcome import json_bytes
-from uw_dslam_ros2.cli.running.examining import mountings_of
+from uw_dslam_ros2.cli.running.examining import ExaminedVehicle, examine_vehicle, together
 from uw_dslam_ros2.cli.running.mapping import sensor_config
 from uw_dslam_ros2.core.clocks import find_gaps
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination
-from uw_dslam_ros2.core.doctor.fleet import share_sound_speed
 from uw_dslam_ros2.core.findings import WORDS, Finding
 from uw_dslam_ros2.core.health import MappedVehicle, SensorCount, sensor_findings
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.io.atomic import write_files
 from uw_dslam_ros2.io.events import VehicleReader
-from uw_dslam_ros2.io.examining import examine_recording
-from uw_dslam_ros2.io.mountings import Mountings
-from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import VehicleRecording, find_recordings
 
@@ -99,15 +95,17 @@ def _parser() -> argparse.ArgumentParser:
 def _run(args: argparse.Namespace) -> int:
     file = SettingsFile(args.config)
     recordings, findings = find_recordings(args.bags, lambda name: sensor_config(file, name))
-    looks = []
+    examined, messages = [], []
     for recording in recordings:
         mapper = file.section(
             VehicleMapperConfig, "mapper", f"/{recording.vehicle_id}/sonar_mapper"
         )
         sensors = sensor_config(file, recording.vehicle_id)
-        looks.append(_look_at(recording, sensors, mapper))
-    shared = share_sound_speed([look.examined for look in looks])
-    diagnoses = [_diagnose(*of_one) for of_one in zip(looks, shared, strict=True)]
+        messages.append(_Messages())
+        examined.append(examine_vehicle(recording, sensors, mapper.sonar, messages[-1].note))
+    diagnoses = [
+        _diagnose(*of_one) for of_one in zip(recordings, together(examined), messages, strict=True)
+    ]
     for diagnosis in diagnoses:
         _print(diagnosis)
         findings += diagnosis.findings
@@ -128,45 +126,21 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Look:
-    """What one recording shows by itself."""
-
-    recording: VehicleRecording
-    about_clocks: list[Finding]
-    mountings: Mountings
-    stamps: Mapping[str, NDArray[np.int64]]
-    messages: _Messages
-    examined: Examination
-
-
-def _look_at(
-    recording: VehicleRecording, sensors: SensorConfig, mapper: VehicleMapperConfig
-) -> _Look:
-    with VehicleReader(recording, sensors) as reader:
-        about_clocks = reader.check_clocks()
-        mountings = mountings_of(recording, sensors, reader.transforms())
-        stamps = reader.stamps
-    messages = _Messages()
-    examined = examine_recording(
-        recording, sensors, mapper.sonar, stamps, mountings.of, messages.note
-    )
-    return _Look(recording, about_clocks, mountings, stamps, messages, examined)
-
-
-def _diagnose(look: _Look, examined: Examination) -> Diagnosis:
-    """All that there is to say; `examined` may know more, by other vehicles, than the look."""
-    recording, messages, stamps = look.recording, look.messages, look.stamps
+def _diagnose(
+    recording: VehicleRecording, vehicle: ExaminedVehicle, messages: _Messages
+) -> Diagnosis:
+    """All that there is to say."""
+    examined, stamps = vehicle.examination, vehicle.stamps
     findings = [
         dataclasses.replace(finding, vehicle_id=recording.vehicle_id)
-        for finding in look.about_clocks
+        for finding in vehicle.about_clocks
     ]
     findings += examined.findings
     findings += [
         dataclasses.replace(finding, vehicle_id=recording.vehicle_id)
         for finding in messages.findings
     ]
-    findings += look.mountings.findings(recording.vehicle_id)
+    findings += vehicle.mountings.findings(recording.vehicle_id)
     findings += sensor_findings(messages.vehicle(recording.vehicle_id, stamps, examined))
     findings += [
         Finding(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +24,14 @@ __all__ = ["ExaminedVehicle", "can_be_mapped", "examine_vehicle", "mountings_of"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExaminedVehicle:
-    """One vehicle's clocks and conventions.
+    """One vehicle's clocks, conventions and mountings.
 
     ``stamps`` has the times (N,) [ns] of each role's messages, on one clock.
     """
 
     stamps: Mapping[str, NDArray[np.int64]]
     about_clocks: tuple[Finding, ...]
+    mountings: Mountings
     examination: Examination
 
 
@@ -40,24 +41,27 @@ def can_be_mapped(recording: VehicleRecording) -> bool:
 
 
 def examine_vehicle(
-    recording: VehicleRecording, sensors: SensorConfig, sonar: SonarConfig
+    recording: VehicleRecording,
+    sensors: SensorConfig,
+    sonar: SonarConfig,
+    note: Callable[[VehicleReader], None] | None = None,
 ) -> ExaminedVehicle:
-    """Examine one recording that can be mapped; `DataError` where its bags cannot be read."""
+    """Examine one recording; `DataError` where its bags cannot be read.
+
+    `note` is called with each reader when it has been read.
+    """
     with VehicleReader(recording, sensors) as reader:
         about_clocks = tuple(reader.check_clocks())
         stamps = reader.stamps
         mountings = mountings_of(recording, sensors, reader.transforms())
-    examination = examine_recording(recording, sensors, sonar, stamps, mountings.of)
-    return ExaminedVehicle(stamps, about_clocks, examination)
+    examination = examine_recording(recording, sensors, sonar, stamps, mountings.of, note)
+    return ExaminedVehicle(stamps, about_clocks, mountings, examination)
 
 
-def together(examined: Sequence[ExaminedVehicle | None]) -> list[ExaminedVehicle | None]:
-    """The same, with what vehicles in one water tell of each other; None stays None."""
-    shared = iter(share_sound_speed([own.examination for own in examined if own is not None]))
-    return [
-        None if own is None else ExaminedVehicle(own.stamps, own.about_clocks, next(shared))
-        for own in examined
-    ]
+def together(examined: Sequence[ExaminedVehicle]) -> list[ExaminedVehicle]:
+    """The same, with what vehicles in one water tell of each other."""
+    shared = share_sound_speed([own.examination for own in examined])
+    return [replace(own, examination=e) for own, e in zip(examined, shared, strict=True)]
 
 
 def mountings_of(

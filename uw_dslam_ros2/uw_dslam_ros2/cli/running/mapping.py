@@ -131,12 +131,16 @@ def map_recordings(
         own = [(r, config.mapper[r.vehicle_id], config.sensors[r.vehicle_id]) for r in recordings]
         count = (lambda: progress(done.value, total)) if progress is not None else None
         try:
-            examined = together(
-                _results([pool.submit(_examined, *of_one) for of_one in own], count)
-            )
+            mappable = [r.vehicle_id for r in recordings if can_be_mapped(r)]
+            looks = [
+                pool.submit(examine_vehicle, recording, sensors, mapper.sonar)
+                for recording, mapper, sensors in own
+                if recording.vehicle_id in mappable
+            ]
+            found = dict(zip(mappable, together(_results(looks, count)), strict=True))
             futures = [
-                pool.submit(map_recording, *of_one, found)
-                for of_one, found in zip(own, examined, strict=True)
+                pool.submit(map_recording, *of_one, found.get(of_one[0].vehicle_id))
+                for of_one in own
             ]
             return _results(futures, count)
         except BrokenProcessPool as error:
@@ -158,14 +162,6 @@ def _results[T](futures: Sequence[Future[T]], count: Callable[[], None] | None) 
             if future.done():
                 future.result()
     return [future.result() for future in futures]
-
-
-def _examined(
-    recording: VehicleRecording, config: VehicleMapperConfig, sensors: SensorConfig
-) -> ExaminedVehicle | None:
-    if not can_be_mapped(recording):
-        return None
-    return examine_vehicle(recording, sensors, config.sonar)
 
 
 _shared: list[Synchronized[int]] = []
