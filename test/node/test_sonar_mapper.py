@@ -238,33 +238,6 @@ def test_where_the_last_pass_moves_the_map_the_frame_goes_along(
     assert math.hypot(end.x - base.x, end.y - base.y) < 0.6 * SPEED_M_S
 
 
-def test_what_a_killed_mapper_kept_is_drawn_anew_by_the_next_one(ros_context, spinning, tmp_path):
-    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context, session=str(tmp_path))
-    with spinning(mapper) as until:
-        until(vehicle.is_connected, "connection")
-        vehicle.send_mount()
-        drive(until, vehicle, range(4))
-        pipeline = mapper._pipeline
-        until(lambda: pipeline._runs.mapper.num_pings == 8, "the pings")
-        # As if killed: no last word.
-        mapper._worker.call(pipeline.close_last).result()
-    (kept,) = tmp_path.glob("run_*.sqlite")
-    mapper = mapper_of(ros_context, session=str(tmp_path))
-    with spinning(mapper, vehicle.node) as until:
-        until(vehicle.is_connected, "connection")
-        vehicle.send_mount()
-        drive(until, vehicle, range(20, 24))
-        until(lambda: mapper._pipeline._runs.mapper.num_pings == 8, "the pings")
-        message = finish(until, vehicle).message
-        assert "1 of them drawn anew, and 1 of before it was started; 0 bad" in message
-        until(lambda: len({msg.run_id for msg in vehicle.submaps}) == 2, "both runs")
-        until(lambda: [msg.revision for msg in vehicle.submaps[-2:]] == [1, 1], "drawn anew")
-    own, earlier = (submap_from_msg(msg) for msg in vehicle.submaps[-2:])
-    assert kept.name == f"run_{earlier.run_id}.sqlite"
-    assert len(earlier.trajectory) == len(own.trajectory) == 8
-    assert list(tmp_path.glob("run_*")) == []
-
-
 def test_frames_can_be_named_and_transforms_left_to_others(ros_context, spinning):
     vehicle = Vehicle(ros_context)
     settings = {"publishes_tf": False, "map_frame": "chart", "odom_frame": "reckoning"}

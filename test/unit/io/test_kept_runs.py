@@ -5,12 +5,16 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from unit.chart.test_redraw import _CONFIG, mapped
 
 from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.chart.redraw import redrawn
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
+from uw_dslam_ros2.io.sessions import kept_runs
+from uw_dslam_ros2.io.sessions.array_files import arrays_to_bytes
 from uw_dslam_ros2.io.sessions.folder_lock import SessionInUseError
 from uw_dslam_ros2.io.sessions.kept_runs import KeptRuns
 
@@ -44,6 +48,7 @@ def ping_of(rng, stamp_ns, bearing_rad, num_points):
         rng.random(len(bearing_rad)).astype(np.float32),
         0.01,
         0.05,
+        SE2(*rng.normal(size=3)) if num_points else None,
     )
 
 
@@ -92,6 +97,40 @@ def test_a_run_comes_back_with_its_pings_and_its_last_poses(run, rng, tmp_path):
     # What one sonar's pings have in common takes memory once.
     first, second, _ = found_pings[submaps[0].submap_id]
     assert first.bearing_rad is second.bearing_rad
+
+
+def test_a_run_that_comes_back_is_drawn_anew_as_from_memory(tmp_path):
+    mapper, memory, _ = mapped()
+    pings = memory.of_submap
+    with closing(KeptRuns(tmp_path)) as kept:
+        kept.save(mapper.submaps(), pings)
+        (path,) = tmp_path.glob("run_*.sqlite")
+        found = redrawn(*kept.load(path), _CONFIG.occupancy)
+    for one, other in zip(found, redrawn(mapper.submaps(), pings, _CONFIG.occupancy), strict=True):
+        assert_equal(one, other)
+    # What instruments alone say of the way is part of that.
+    without = {
+        submap_id: [dataclasses.replace(ping, T_dead_sonar=None) for ping in of_it]
+        for submap_id, of_it in pings.items()
+    }
+    others = redrawn(mapper.submaps(), without, _CONFIG.occupancy)
+    assert [s.T_odom_submap for s in others] != [s.T_odom_submap for s in found]
+
+
+def test_a_file_of_before_dead_reckoning_was_kept_is_read(run, tmp_path, monkeypatch):
+    submaps, pings = run
+
+    def as_before(arrays):
+        return arrays_to_bytes({n: a for n, a in arrays.items() if n != "T_dead_sonar"})
+
+    monkeypatch.setattr(kept_runs, "arrays_to_bytes", as_before)
+    with closing(KeptRuns(tmp_path)) as kept:
+        kept.save(submaps, pings)
+        (path,) = tmp_path.glob("run_*.sqlite")
+        _, found = kept.load(path)
+    for submap_id, of_it in pings.items():
+        for one, other in zip(found[submap_id], of_it, strict=True):
+            assert_equal(one, dataclasses.replace(other, T_dead_sonar=None))
 
 
 def test_a_damaged_run_is_named(run, tmp_path):

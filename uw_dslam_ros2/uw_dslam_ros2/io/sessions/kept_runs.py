@@ -36,6 +36,8 @@ KeptRun = tuple[list[Submap], dict[SubmapId, list[DrawnPing]]]
 """Submaps of a run in their order, as given away last, and what is kept of their pings."""
 _MAX_BYTES = 1 << 28
 """Of one submap, and of its pings."""
+_UNKNOWN = np.full(3, np.nan)
+"""A pose."""
 
 
 class KeptRuns:
@@ -151,6 +153,9 @@ def _pings_to_bytes(pings: Sequence[DrawnPing]) -> bytes:
         {
             "stamp_ns": np.array([p.stamp_ns for p in pings], np.int64),
             "T_submap_sonar": np.array([p.T_submap_sonar.as_array() for p in pings]),
+            "T_dead_sonar": np.array(
+                [_UNKNOWN if p.T_dead_sonar is None else p.T_dead_sonar.as_array() for p in pings]
+            ),
             "beamwidth_rad": np.array([p.beamwidth_rad for p in pings]),
             "range_sigma_m": np.array([p.range_sigma_m for p in pings]),
             "num_points": np.array([len(p.points) for p in pings], np.int64),
@@ -168,10 +173,13 @@ def _pings_to_bytes(pings: Sequence[DrawnPing]) -> bytes:
 def _pings_from_bytes(content: bytes) -> list[DrawnPing]:
     arrays = arrays_from_bytes(content, _MAX_BYTES)
     points, beams = (np.cumsum(arrays[name])[:-1] for name in ("num_points", "num_beams"))
+    # Files of before do not have it.
+    dead_reckoning = arrays.get("T_dead_sonar", np.full((len(arrays["stamp_ns"]), 3), np.nan))
     pings: list[DrawnPing] = []
-    for stamp_ns, place, beamwidth_rad, sigma_m, xy, weight, free_range_m, bearing_rad in zip(
+    for stamp_ns, place, dead, beamwidth_rad, sigma_m, xy, weight, free_m, bearing_rad in zip(
         arrays["stamp_ns"].tolist(),
         arrays["T_submap_sonar"],
+        dead_reckoning,
         arrays["beamwidth_rad"].tolist(),
         arrays["range_sigma_m"].tolist(),
         np.split(arrays["points"], points),
@@ -189,9 +197,10 @@ def _pings_from_bytes(content: bytes) -> list[DrawnPing]:
                 xy,
                 weight,
                 bearing_rad,
-                free_range_m,
+                free_m,
                 beamwidth_rad,
                 sigma_m,
+                None if np.isnan(dead).any() else SE2.from_array(dead),
             )
         )
     return pings
