@@ -61,3 +61,20 @@ def test_the_next_mapper_draws_it_anew_as_the_killed_one_would_have(
     assert earlier.submap_id == expected.submap_id
     np.testing.assert_array_equal(placed([earlier]), placed([expected]))
     np.testing.assert_array_equal(earlier.grid.values, expected.grid.values)
+
+
+def test_a_disk_that_takes_nothing_stops_no_mapping(ros_context, spinning, tmp_path):
+    away = tmp_path / "disk"
+    away.write_text("a file, and no folder")
+    vehicle, mapper = Vehicle(ros_context), mapper_of(ros_context, session=str(away / "auv_1"))
+    with spinning(mapper, vehicle.node) as until:
+        until(vehicle.is_connected, "connection")
+        until(lambda: "cannot write to the session" in vehicle.message(), "the complaint")
+        vehicle.send_mount()
+        drive(until, vehicle, range(4))
+        pipeline = mapper._pipeline
+        until(lambda: pipeline._runs.mapper.num_pings == 8, "the pings")
+        away.unlink()  # and it is back
+        mapper._worker.call(pipeline.close_last).result()
+        until(lambda: vehicle.submaps, "the submap")
+        assert list((away / "auv_1").glob("run_*"))

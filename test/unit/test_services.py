@@ -44,6 +44,19 @@ def test_a_unit_restarts_its_node_and_watches_it(path):
     assert (ROOT / "config" / settings).is_file()
 
 
+@pytest.mark.parametrize("path", UNITS, ids=lambda path: path.stem)
+def test_a_unit_keeps_what_a_restart_would_lose_where_it_may_write(path):
+    service = read(path)["Service"]
+    session = re.search(r"session:=(\S+)'", service["ExecStart"])
+    if executable(read(path)) == "registration_server":
+        assert session is None
+        return
+    folder = Path("/var/lib") / service["StateDirectory"]
+    assert Path(session[1]).is_relative_to(folder)
+    # One unit for many vehicles: each has its own.
+    assert ("%i" in session[1]) == ("@" in path.name)
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not here")
 def test_systemd_takes_the_units(tmp_path):
     paths = [shutil.copy(path, tmp_path) for path in (ROOT / "config" / "systemd").iterdir()]
@@ -64,6 +77,18 @@ def test_the_containers_restart_and_are_looked_after():
         assert service["restart"] == "unless-stopped"
         file = service["environment"]["UW_ALIVE_FILE"]
         assert file in service["healthcheck"]["test"][1]
+
+
+def test_the_containers_keep_what_a_restart_would_lose_outside():
+    services = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text())["services"]
+    sessions = []
+    for service in services.values():
+        if service["command"][1] in ("sonar_mapper", "map_queue_manager"):
+            (session,) = re.findall(r"session:=(\S+)", " ".join(service["command"]))
+            mounted = [volume.rsplit(":", 1)[1] for volume in service["volumes"]]
+            assert any(Path(session).is_relative_to(folder) for folder in mounted)
+            sessions.append(session)
+    assert len(set(sessions)) == len(sessions) == 4
 
 
 @pytest.fixture

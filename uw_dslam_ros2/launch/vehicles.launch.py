@@ -82,6 +82,7 @@ def make_nodes(context):
     clock = {"use_sim_time": is_replay}
     config = LaunchConfiguration("config_dir").perform(context)
     replay_settings = [f"{config}/replay.yaml"] if is_replay else []
+    session = text_of(context, "session")
     nodes = [
         Node(
             package=PACKAGE,
@@ -96,6 +97,7 @@ def make_nodes(context):
                     else []
                 ),
                 *topic_parameters(recordings.get(name)),
+                {"session": f"{session}/mappers/{name}" if session else ""},
                 clock,
             ],
             output="screen",
@@ -116,7 +118,7 @@ def make_nodes(context):
             executable="map_queue_manager",
             parameters=[
                 f"{config}/map_queue_manager.yaml",
-                {"vehicles": names, "session": text_of(context, "session")},
+                {"vehicles": names, "session": session},
                 clock,
             ],
             output="screen",
@@ -187,7 +189,7 @@ def generate_launch_description():
         "rate": ("1.0", "recorded seconds per second"),
         "start": ("0.0", "begin this long after the first message [s]"),
         "duration": ("0.0", "play this much [s]; 0: to the end"),
-        "session": ("", "folder in which the map queue keeps its state; empty: none"),
+        "session": ("", "folder in which all is kept over a restart; empty: none"),
         "mapper_config": ("", "a further YAML file for the mappers"),
         "exit_at_end": ("false", "end everything when the bags are played"),
         "rviz": ("false", "start RViz"),

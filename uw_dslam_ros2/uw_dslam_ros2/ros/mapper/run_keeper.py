@@ -8,6 +8,7 @@ from uw_dslam_ros2.core.chart.pings import DrawnPing
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.mapping import OccupancyConfig
 from uw_dslam_ros2.core.submap import Submap, SubmapId
+from uw_dslam_ros2.io.sessions.folder_lock import SessionInUseError
 from uw_dslam_ros2.io.sessions.kept_runs import KeptRuns
 
 __all__ = ["RunKeeper"]
@@ -23,22 +24,36 @@ class RunKeeper:
     config
         Grid and sensor model of the mappers.
     complain
-        Told when the disk does not take something, or gives it back damaged.
+        Told when the disk does not take something, or gives it back damaged: mapping goes on.
+
+    Raises
+    ------
+    SessionInUseError
+        If another process has the folder.
     """
 
     def __init__(
         self, folder: str, config: OccupancyConfig, complain: Callable[[str], None]
     ) -> None:
-        self._runs = KeptRuns(folder) if folder else None
-        self._config, self._complain = config, complain
+        self._folder, self._config, self._complain = folder, config, complain
+        self._runs: KeptRuns | None = None
+        if folder:
+            try:
+                self._runs = KeptRuns(folder)
+            except SessionInUseError:
+                raise
+            except DataError as error:
+                complain(str(error))
 
     def keep(
         self, submaps: Sequence[Submap], pings: Mapping[SubmapId, Sequence[DrawnPing]]
     ) -> None:
         """Keep submaps that are about to be given away, with their pings."""
-        if self._runs is None or not submaps:
+        if not self._folder or not submaps:
             return
         try:
+            if self._runs is None:
+                self._runs = KeptRuns(self._folder)  # the disk may be back
             self._runs.save(submaps, pings)
         except DataError as error:
             self._complain(str(error))
