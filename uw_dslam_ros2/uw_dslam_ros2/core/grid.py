@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import itertools
 import math
 from dataclasses import dataclass
@@ -145,6 +146,11 @@ class OccupancyMap:
         0 and 100 count as half a percent from certainty.
         """
         return np.where(self.known, _UNITS_OF_PERCENT[self.values], UNSEEN)
+
+    def cells_digest(self) -> str:
+        """Of the cells and their place (16 hexadecimal digits): of equal maps the same."""
+        content = repr(self.spec).encode() + self.values.tobytes()
+        return hashlib.blake2b(content, digest_size=8).hexdigest()
 
 
 _PROBABILITY = np.clip(np.arange(101) / 100.0, 0.005, 0.995)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 from uw_dslam_ros2.cli.reporting.map_drawing import INK, VEHICLE_COLORS, blank_figure
 from uw_dslam_ros2.cli.reporting.scoring import Truth
 from uw_dslam_ros2.cli.running.demo_link import LinkedMission
-from uw_dslam_ros2.core.merging import MapQueue, MapQueueConfig
+from uw_dslam_ros2.core.merging import MapQueueConfig
 from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.io.sessions.session import load_session
 
@@ -28,10 +27,10 @@ def add_maps(
 ) -> list[str]:
     """Say of each vehicle what its own manager's map is worth, and whether all have the same.
 
-    `link` is what `run_linked` found; of each vehicle num_vehicles_merged, rmse_m and map_digest
-    are added to it, and is_same_map. Returns a note where they have not.
+    `link` is what `run_linked` found; of each vehicle num_vehicles_merged, rmse_m and cells_digest
+    (None without a map) are added to it, and is_same_map. Returns a note where they have not.
     """
-    digests = {}
+    digests: dict[str, str | None] = {}
     for vehicle in mission.vehicles:
         queue = load_session(mission.session_folder(out, vehicle), config)
         found = {
@@ -41,21 +40,14 @@ def add_maps(
             "num_vehicles_merged": len(queue.trajectories()),
             "rmse_m": trajectory_error(found, truth.trajectories).rmse_m if found else None,
         }
-        digests[vehicle] = link["vehicles"][vehicle]["map_digest"] = _digest(queue)
+        drawn = queue.global_map()
+        digests[vehicle] = None if drawn is None else drawn.cells_digest()
+        link["vehicles"][vehicle]["cells_digest"] = digests[vehicle]
     link["is_same_map"] = len(set(digests.values())) == 1
     if link["is_same_map"]:
         return []
     told = ", ".join(f"{vehicle} {digest}" for vehicle, digest in digests.items())
     return [f"The vehicles' maps are not the same, byte for byte: {told}."]
-
-
-def _digest(queue: MapQueue) -> str:
-    """Of the map's cells and their place; empty without a map."""
-    occupancy = queue.global_map()
-    if occupancy is None:
-        return ""
-    data = repr(occupancy.spec).encode() + occupancy.values.tobytes()
-    return hashlib.blake2b(data, digest_size=8).hexdigest()
 
 
 def known_over_time(link: Mapping[str, Any]) -> Figure:

@@ -10,7 +10,6 @@ registrations come from the true poses with noise, and a share of them can be wr
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections.abc import Callable
 from typing import Any
 
@@ -106,6 +105,8 @@ def _trial(fleet: Fleet, matcher: Matcher, seed: int, order: int, mode: str) -> 
             queue.add_submap(fleet.submaps[submap_id])
     num_searches = answer_all(queue, matcher)
     merged = [record for record in queue.submaps() if record.component == 0]
+    fused = queue.global_map()
+    assert fused is not None
     return {
         "place": seed,
         "order": " ".join(shuffled),
@@ -113,15 +114,8 @@ def _trial(fleet: Fleet, matcher: Matcher, seed: int, order: int, mode: str) -> 
         "rmse_m": round(fleet.position_rmse_m(queue), 4),
         "merged_share": round(len(merged) / len(fleet.submaps), 3),
         "num_searches": num_searches,
-        "map_digest": _digest_of(queue),
+        "cells_digest": fused.cells_digest(),
     }
-
-
-def _digest_of(queue: MapQueue) -> str:
-    fused = queue.global_map()
-    assert fused is not None
-    content = repr(fused.spec).encode() + fused.values.tobytes()
-    return hashlib.blake2b(content, digest_size=8).hexdigest()
 
 
 def _draw(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
@@ -147,7 +141,7 @@ def _report(rows: list[dict[str, Any]]) -> None:
         places = sorted({row["place"] for row in of_mode})
         spreads = [np.ptp([r["rmse_m"] for r in of_mode if r["place"] == p]) for p in places]
         errors = [row["rmse_m"] for row in of_mode]
-        digests = [len({r["map_digest"] for r in of_mode if r["place"] == p}) for p in places]
+        digests = [len({r["cells_digest"] for r in of_mode if r["place"] == p}) for p in places]
         table.append(
             (
                 mode,
