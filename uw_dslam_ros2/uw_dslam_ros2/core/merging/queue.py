@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.drawn.trajectories import Trajectory, trajectories_of
@@ -188,13 +186,7 @@ class MapQueue(SteeredQueue):
 
     def map_digest(self) -> bytes:
         """Of what the global map is drawn from (8 bytes): who has the same has the same map."""
-        merged = self._merged()
-        withdrawn = self._decisions.withdrawn(merged)
-        hasher = hashlib.blake2b(repr(self._now.frame.lattice).encode(), digest_size=8)
-        for submap_id, T in sorted(merged.items()):
-            hasher.update(repr((submap_id, submap_id in withdrawn, *T.as_array())).encode())
-            hasher.update(self._submaps[submap_id].fingerprint)
-        return hasher.digest()
+        return self._now.digest(self._plan())
 
     def maps_of(self, query: Query) -> tuple[OccupancyMap, OccupancyMap]:
         """Source and target of a question, whose submaps are held."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 from uw_dslam_ros2.core.merging.arrivals import Arrivals
 from uw_dslam_ros2.core.merging.asking.plan import Plan
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
@@ -41,6 +43,7 @@ class Standing:
         self.drawing = Drawing()
         self._library: Library | None = None
         self._plan: Plan | None = None
+        self._digest: bytes | None = None
 
     def set_decisions(self, log: DecisionLog, *, keeps: bool) -> None:
         """Have another log; `keeps`: what stood because of the one before goes on to stand."""
@@ -58,7 +61,7 @@ class Standing:
 
     def change(self) -> None:
         """Something changed."""
-        self._plan = None
+        self._plan = self._digest = None
         self.drawing.note_change()
 
     def library(self) -> Library:
@@ -118,6 +121,18 @@ class Standing:
             return None
         withdrawn = self.decisions.withdrawn(merged)
         return self.drawing.drawn(lattice, self._arrivals.submaps, merged, withdrawn)
+
+    def digest(self, plan: Plan) -> bytes:
+        """Of what the map is drawn from (8 bytes); worked out once between two changes."""
+        if self._digest is None:
+            merged = self.merged(plan)
+            withdrawn = self.decisions.withdrawn(merged)
+            hasher = hashlib.blake2b(repr(self.frame.lattice).encode(), digest_size=8)
+            for submap_id, T in sorted(merged.items()):
+                hasher.update(repr((submap_id, submap_id in withdrawn, *T.as_array())).encode())
+                hasher.update(self._arrivals.submaps[submap_id].fingerprint)
+            self._digest = hasher.digest()
+        return self._digest
 
     def _sound(self, library: Library) -> dict[SubmapId, StoredSubmap]:
         """What the frame may be pinned to."""
