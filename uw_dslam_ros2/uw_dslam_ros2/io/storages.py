@@ -110,7 +110,7 @@ def open_storages(path: Path, stack: ExitStack) -> Storages:
                 return [_open_folder(path, stack)], _unlisted(path)
             except (*BROKEN, OSError) as error:
                 problem = str(error) or type(error).__name__
-                expected = _expected_count(path / "metadata.yaml")
+                expected = _expected_count(path)
         files = _files_of(path)
         if not files and not problem:
             raise DataError(f"{path} holds no recording; {_EXPECTED}")
@@ -173,10 +173,15 @@ def _files_of(folder: Path) -> list[Path]:
     )
 
 
-def _expected_count(path: Path) -> int | None:
+def _metadata(folder: Path) -> dict[str, Any]:
+    """What the recorder wrote of a recording, as it stands there."""
+    content = yaml.safe_load((folder / "metadata.yaml").read_text())
+    return dict(content["rosbag2_bagfile_information"])
+
+
+def _expected_count(folder: Path) -> int | None:
     try:
-        content = yaml.safe_load(path.read_text())["rosbag2_bagfile_information"]
-        return int(content["message_count"])
+        return int(_metadata(folder)["message_count"])
     except (OSError, yaml.YAMLError, *BROKEN):
         return None
 
@@ -210,9 +215,7 @@ def _hidden_topics(reader: Reader) -> list[str]:
 
 def _unlisted(path: Path) -> str:
     """What to say of files that lie in the folder, but are not in its metadata."""
-    content = yaml.safe_load((path / "metadata.yaml").read_text())
-    listed = content["rosbag2_bagfile_information"]["relative_file_paths"]
-    names = {Path(name).name for name in listed}
+    names = {Path(name).name for name in _metadata(path)["relative_file_paths"]}
     others = [file.name for file in _files_of(path) if file.name not in names]
     if not others:
         return ""
