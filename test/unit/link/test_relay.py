@@ -7,15 +7,20 @@ from unit.link.test_link import fleet, own_submap, same_everywhere
 from uw_dslam_ros2.core.link import AcousticLink, LinkConfig
 from uw_dslam_ros2.core.link.coding.items import PeerReport
 from uw_dslam_ros2.core.link.transport.erasure import restore
-from uw_dslam_ros2.core.link.transport.packets import Packet, framed, read_framed
-from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED, Relays
+from uw_dslam_ros2.core.link.transport.packets import (
+    FIRST_RELAYED,
+    Packet,
+    framed,
+    read_framed,
+)
+from uw_dslam_ros2.core.link.transport.relay import Relays
 
 ITEM = bytes(range(150))  # three parts of 64 bytes
-HELD, EPOCHS = {1: {0: b"hello", 1: ITEM}}, {1: 2}
+HELD, LIVES = {1: {0: b"hello", 1: ITEM}}, {1: (2, 1234)}
 
 
-def relayed(relays, peers=(3,), epochs=EPOCHS, loss=0.0):
-    data = relays.next_packet(HELD, epochs, peers, loss, b"")
+def relayed(relays, peers=(3,), lives=LIVES, loss=0.0):
+    data = relays.next_packet(HELD, lives, peers, loss, b"")
     return None if data is None else Packet.unpack(data, b"")
 
 
@@ -32,6 +37,7 @@ def test_what_somebody_lacks_is_sent_as_often_as_it_is_lacking():
     relays.hear(1, 3, PeerReport(2, 1, (2,)))
     found = all_relayed(relays)
     assert [(p.sender, p.epoch, p.number, p.num_needed) for p in found] == [(1, 2, 1, 3)] * 2
+    assert {p.life for p in found} == {1234}
     assert min(p.index for p in found) >= FIRST_RELAYED
     data = framed(1, ITEM)
     first = data[: -(-len(data) // 3)]
@@ -66,19 +72,20 @@ def test_two_who_help_send_different_sums():
 
 
 @pytest.mark.parametrize(
-    ("report", "peers", "epochs"),
+    ("report", "peers", "lives"),
     [
-        (PeerReport(2, 2), (3,), EPOCHS),  # has all
-        (PeerReport(2, 1, (0,)), (3,), EPOCHS),
-        (PeerReport(2, 1, (), True), (3,), EPOCHS),  # had no room to say it
-        (PeerReport(2, 1), (), EPOCHS),  # has not been heard for long
-        (PeerReport(2, 1), (3,), {1: 3}),  # what is here is of another epoch
+        (PeerReport(2, 2), (3,), LIVES),  # has all
+        (PeerReport(2, 1, (0,)), (3,), LIVES),
+        (PeerReport(2, 1, (), True), (3,), LIVES),  # had no room to say it
+        (PeerReport(2, 1), (), LIVES),  # has not been heard for long
+        (PeerReport(2, 1), (3,), {1: (3, 1234)}),  # what is here is of another epoch
+        (PeerReport(2, 1), (3,), {}),  # of which is not known: no report has been heard
     ],
 )
-def test_who_lacks_nothing_that_is_here_gets_nothing(report, peers, epochs):
+def test_who_lacks_nothing_that_is_here_gets_nothing(report, peers, lives):
     relays = Relays(2, 64)
     relays.hear(1, 3, report)
-    assert relayed(relays, peers, epochs) is None
+    assert relayed(relays, peers, lives) is None
 
 
 def test_who_is_out_of_range_gets_everything_by_way_of_others():
@@ -88,7 +95,9 @@ def test_who_is_out_of_range_gets_everything_by_way_of_others():
     assert talk.links[2].counts.sent_packets["relayed"] > 0
     assert talk.links[4].name_of(1) == "auv_1"
     assert talk.links[4].age_s(1, talk.now_s) is None, "itself it was never heard"
-    assert all(not link.counts.refused for link in talk.links.values())
+    # But for the first one of a vehicle of which no report has come.
+    assert all(set(link.counts.refused) <= {"a relayed packet"} for link in talk.links.values())
+    assert all(sum(link.counts.refused.values()) <= 2 for link in talk.links.values())
 
 
 def test_what_a_vehicle_said_before_it_fell_silent_comes_to_all():
@@ -129,4 +138,36 @@ def test_repairs_by_others_neither_begin_an_epoch_nor_count_as_heard():
     assert link.name_of(1) == "auv_1"
     assert link.to_state().received[1].epoch == 1
     assert link.age_s(1, 60.0) == 60.0
-    assert not link.counts.refused
+    assert link.counts.refused == {"a relayed packet": 1}
+
+
+def exchange(first, second, *, begin_s, num):
+    """Each sends in turn, five seconds after the last."""
+    for turn in range(num):
+        now_s = begin_s + 5.0 * turn
+        for sender, receiver in ((first, second), (second, first)):
+            if (data := sender.next_packet(now_s)) is not None:
+                receiver.receive(data, now_s)
+
+
+@pytest.mark.parametrize("is_report_heard", [True, False])
+def test_old_parts_of_a_link_that_began_anew_are_not_taken_for_new_ones(is_report_heard):
+    """Of two lives packets tell two bits, which are alike here; who relays knows no better."""
+    old, new, third = (
+        AcousticLink(LinkConfig(number=number), f"auv_{number}", epoch=epoch)
+        for number, epoch in ((1, 1), (1, 5), (3, 0))
+    )
+    link = AcousticLink(LinkConfig(number=2), "auv_2")
+    for sequence in range(2):
+        old.add_submap(own_submap(1, sequence))
+    exchange(old, third, begin_s=0.0, num=60)
+    if is_report_heard:
+        exchange(new, link, begin_s=300.0, num=2)
+    new.add_submap(own_submap(1, 7))
+    exchange(link, third, begin_s=310.0, num=58)
+    assert third.counts.sent_packets["relayed"] > 5
+    assert bool(list(link.submaps())) != is_report_heard
+    exchange(link, new, begin_s=600.0, num=60)
+    assert 7 in {s.sequence for s in link.submaps() if s.vehicle_id == "auv_1"}
+    assert link.is_complete
+    assert new.num_unconfirmed(900.0) == 0

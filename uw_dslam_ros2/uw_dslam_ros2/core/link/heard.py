@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.link.coding.items import ItemKind, PeerReport
 from uw_dslam_ros2.core.link.transport.inbox import Inbox
+from uw_dslam_ros2.core.link.transport.packets import Packet
 from uw_dslam_ros2.core.link.types import ReceivedState
 
 __all__ = ["Heard"]
@@ -18,6 +20,7 @@ class Heard:
         """All that is here, by sender and number."""
         self.last_s: dict[int, float] = {}
         self._told: dict[ItemKind, list[bytes]] = {}  # answers and decisions
+        self._rumours: dict[int, tuple[int, int]] = {}  # lives that one relayed packet has named
 
     def begin(self, sender: int, epoch: int) -> Inbox:
         """Forget a sender, which has begun anew."""
@@ -52,9 +55,29 @@ class Heard:
         """Items that they are known to have said and that are not here."""
         return sum(inbox.num_lacking for inbox in self.inboxes.values())
 
-    def epochs(self) -> dict[int, int]:
-        """Of each sender."""
-        return {sender: inbox.epoch for sender, inbox in self.inboxes.items()}
+    def lives(self) -> dict[int, tuple[int, int]]:
+        """Epoch of each sender and what it has drawn beyond, where that is known."""
+        return {
+            sender: (inbox.epoch, inbox.life)
+            for sender, inbox in self.inboxes.items()
+            if inbox.life is not None
+        }
+
+    def check_relayed(self, packet: Packet) -> None:
+        """Refuse a relayed packet that is damaged, or older than what its sender says now.
+
+        As long as no report has told what the sender has drawn, two of them must agree on it.
+        """
+        sender, life = packet.sender, (packet.epoch, packet.life)
+        inbox = self.inboxes.get(sender)
+        if inbox is not None and (inbox.life is not None or inbox.epoch != packet.epoch):
+            if life != (inbox.epoch, inbox.life):
+                raise InvalidInputError(f"a relayed packet of {sender} is damaged or of old")
+        elif self._rumours.get(sender) != life:
+            self._rumours[sender] = life
+            raise InvalidInputError(f"a relayed packet of {sender} is the first of that life")
+        else:
+            (inbox or self.begin(sender, packet.epoch)).life = packet.life
 
     def reports(self, turn: int) -> dict[int, PeerReport]:
         """What has come of each; another one first each turn, as there may not be room for all."""

@@ -17,7 +17,7 @@ from uw_dslam_ros2.core.link.transport.packets import (
     read_framed,
     unbundled,
 )
-from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED, Relays
+from uw_dslam_ros2.core.link.transport.relay import Relays
 from uw_dslam_ros2.core.link.types import LinkConfig
 from uw_dslam_ros2.core.submap import Submap
 
@@ -80,8 +80,8 @@ class AcousticLink(LinkEnd):
 
     def _relayed(self, peers: list[int]) -> bytes | None:
         """A repair of what somebody else has said, for a turn that would be left empty."""
-        items, epochs = self._heard.items, self._heard.epochs()
-        return self._relays.next_packet(items, epochs, peers, self.loss, self._key)
+        items, lives = self._heard.items, self._heard.lives()
+        return self._relays.next_packet(items, lives, peers, self.loss, self._key)
 
     def _counted(self, label: str, packet: bytes) -> bytes:
         self._reporting.sent(is_report=label == "status")
@@ -113,9 +113,12 @@ class AcousticLink(LinkEnd):
         """
         try:
             packet = Packet.unpack(data, self._key)
-            is_relayed = packet.num_needed > 0 and packet.index >= FIRST_RELAYED
-            if packet.sender == self._config.number and not is_relayed:
+            if packet.sender == self._config.number:
+                if packet.is_relayed and (packet.epoch, packet.life) == (self._epoch, self._life):
+                    return []
                 raise InvalidInputError(f"packet of sender {packet.sender}, which is this vehicle")
+            if packet.is_relayed:
+                self._heard.check_relayed(packet)
         except InvalidInputError as error:
             self._refuse(error)
             return []
@@ -123,11 +126,7 @@ class AcousticLink(LinkEnd):
         self.counts.received_bytes += len(data)
         sender = packet.sender
         inbox = self._heard.inboxes.get(sender)
-        if is_relayed:
-            is_old = inbox is not None and inbox.epoch != packet.epoch
-            if is_old or sender == self._config.number:
-                return []
-        else:
+        if not packet.is_relayed:
             self._heard.last_s[sender] = now_s
         if inbox is None or inbox.epoch != packet.epoch:
             inbox = self._begun(sender, packet.epoch)

@@ -7,8 +7,15 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.link.coding.items import PeerReport, whole_note
-from uw_dslam_ros2.core.link.transport.packets import Packet, bundled, framed, num_parts, part_of
-from uw_dslam_ros2.core.link.transport.relay import FIRST_RELAYED, LOSS_LIMIT, num_repairs
+from uw_dslam_ros2.core.link.transport.packets import (
+    FIRST_RELAYED,
+    Packet,
+    bundled,
+    framed,
+    num_parts,
+    part_of,
+)
+from uw_dslam_ros2.core.link.transport.relay import LOSS_LIMIT, num_repairs
 
 __all__ = ["OutItem", "Outbox"]
 

@@ -3,6 +3,10 @@
 A packet holds one fragment of a numbered item, or a bundle of short notes that are not worth
 repeating. Layout, in bits: version 2, epoch 2, sender 5, number 10, parts needed 6 (0: a bundle),
 index 7; then the payload; then 16 bits of checksum.
+
+Fragments from index 96 on come from others than who said the item. Their checksum is the exclusive
+or with the 16 bits that the sender has drawn when it began with nothing: so whoever knows these
+tells old from new.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ from uw_dslam_ros2.core.link.coding.fields import ByteReader, ByteWriter, digest
 from uw_dslam_ros2.core.link.transport.erasure import MAX_NEEDED, fragment
 
 __all__ = [
+    "FIRST_RELAYED",
     "MAX_PACKET_BYTES",
     "MAX_SENDERS",
     "MIN_PACKET_BYTES",
@@ -29,11 +34,14 @@ __all__ = [
     "unbundled",
 ]
 
-PACKET_VERSION = 3
+PACKET_VERSION = 0
+"""Of two bits: what came before 0 was 3."""
 OVERHEAD_BYTES = 6
 MIN_PACKET_BYTES, MAX_PACKET_BYTES = 32, 2048
 MAX_SENDERS = 32
 NUM_NUMBERS = 1024
+FIRST_RELAYED = 96
+"""Fragments from this index on come from others than who said the item."""
 _HEADER_BYTES = 4
 _CHECK_BYTES = 2
 
@@ -48,6 +56,13 @@ class Packet:
     num_needed: int
     index: int
     payload: bytes
+    life: int = 0
+    """What the sender has drawn, of a relayed fragment; so it is for the caller to check."""
+
+    @property
+    def is_relayed(self) -> bool:
+        """Whether it comes from another vehicle than the sender."""
+        return self.num_needed > 0 and self.index >= FIRST_RELAYED
 
     def pack(self, key: bytes) -> bytes:
         """To bytes."""
@@ -59,7 +74,8 @@ class Packet:
         ):
             header = header << num_bits | value
         data = (header << 7 | self.index).to_bytes(_HEADER_BYTES, "big") + self.payload
-        return data + digest_of(data, key, _CHECK_BYTES)
+        check = _check_of(data, key) ^ (self.life if self.is_relayed else 0)
+        return data + check.to_bytes(_CHECK_BYTES, "big")
 
     @classmethod
     def unpack(cls, data: bytes, key: bytes) -> Packet:
@@ -70,21 +86,27 @@ class Packet:
                 f"{MAX_PACKET_BYTES}"
             )
         content, check = data[:-_CHECK_BYTES], data[-_CHECK_BYTES:]
-        if digest_of(content, key, _CHECK_BYTES) != check:
-            raise InvalidInputError(f"checksum of the packet is not {check.hex()}")
         header = int.from_bytes(content[:_HEADER_BYTES], "big")
         if header >> 30 != PACKET_VERSION:
             raise InvalidInputError(
                 f"version of the packet is {header >> 30}, expected {PACKET_VERSION}"
             )
-        return cls(
+        packet = cls(
             header >> 28 & 3,
             header >> 23 & 31,
             header >> 13 & 1023,
             header >> 7 & 63,
             header & 127,
             content[_HEADER_BYTES:],
+            int.from_bytes(check, "big") ^ _check_of(content, key),
         )
+        if packet.life and not packet.is_relayed:
+            raise InvalidInputError(f"checksum of the packet is not {check.hex()}")
+        return packet
+
+
+def _check_of(content: bytes, key: bytes) -> int:
+    return int.from_bytes(digest_of(content, key, _CHECK_BYTES), "big")
 
 
 def framed(number: int, item: bytes) -> bytes:

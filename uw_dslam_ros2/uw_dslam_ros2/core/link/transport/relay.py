@@ -9,14 +9,18 @@ from dataclasses import dataclass
 
 from uw_dslam_ros2.core.link.coding.items import PeerReport
 from uw_dslam_ros2.core.link.transport.erasure import MAX_INDEX
-from uw_dslam_ros2.core.link.transport.packets import Packet, framed, num_parts, part_of
+from uw_dslam_ros2.core.link.transport.packets import (
+    FIRST_RELAYED,
+    Packet,
+    framed,
+    num_parts,
+    part_of,
+)
 
-__all__ = ["FIRST_RELAYED", "LOSS_LIMIT", "Relays", "num_repairs"]
+__all__ = ["LOSS_LIMIT", "Relays", "num_repairs"]
 
 LOSS_LIMIT = 0.6
 """Beyond that, more repair in advance only crowds the others out."""
-FIRST_RELAYED = 96
-"""Fragments from this index on come from others than who said the item."""
 _APART = 11  # between the first indices of two neighbouring vehicles
 
 Place = tuple[int, int]
@@ -66,7 +70,7 @@ class Relays:
     def next_packet(
         self,
         items: Mapping[int, Mapping[int, bytes]],
-        epochs: Mapping[int, int],
+        lives: Mapping[int, tuple[int, int]],
         peers: Iterable[int],
         loss: float,
         key: bytes,
@@ -77,8 +81,8 @@ class Relays:
         ----------
         items
             All that is here, by sender and number.
-        epochs
-            Of the senders.
+        lives
+            Epoch of each sender and what it has drawn beyond; nothing of others is relayed.
         peers
             Who listens.
         loss
@@ -89,7 +93,9 @@ class Relays:
         known = set(peers)
         best: tuple[tuple[int, int, int], bytes] | None = None
         for (sender, peer), heard in sorted(self._heard.items()):
-            if peer not in known or heard.report.epoch != epochs.get(sender):
+            if peer not in known or sender not in lives:
+                continue
+            if heard.report.epoch != lives[sender][0]:
                 continue
             for number, content in items.get(sender, {}).items():
                 if number < heard.report.base:
@@ -104,12 +110,12 @@ class Relays:
         if best is None:
             return None
         (_, number, sender), data = best
-        return self._cut((sender, number), data, epochs[sender], key)
+        return self._cut((sender, number), data, lives[sender], key)
 
     def _since(self, item: Place, heard: _Heard) -> int:
         return self._gone[item] - heard.marks.get(item[1], 0)
 
-    def _cut(self, item: Place, data: bytes, epoch: int, key: bytes) -> bytes:
+    def _cut(self, item: Place, data: bytes, life: tuple[int, int], key: bytes) -> bytes:
         parts = num_parts(len(data), self._max_bytes)
         first = _APART * self._number + self._sent[item]
         index = FIRST_RELAYED + first % (MAX_INDEX + 1 - FIRST_RELAYED)
@@ -117,4 +123,4 @@ class Relays:
         self._gone[item] += 1
         self._sent[item] += 1
         self.num_sent += 1
-        return Packet(epoch, item[0], item[1], parts, index, payload).pack(key)
+        return Packet(life[0], item[0], item[1], parts, index, payload, life[1]).pack(key)
