@@ -154,6 +154,19 @@ def test_raw_data_go_behind_what_the_driver_made_of_them():
     assert vehicle.topics["imu"] == "/auv_1/imu/data"
 
 
+def test_a_number_is_a_heading_only_by_its_name_and_beside_no_imu():
+    number = "std_msgs/msg/Float64"
+    named = {"/r/imu/temperature": number, "/r/imu/heading_rate": "std_msgs/msg/String"}
+    sensors = {"/r/sonar": SONAR, "/r/dvl": DVL, **named}
+    (vehicle,) = find_vehicles([sensors], ["bag"])
+    assert "imu" not in vehicle.topics
+    compass = {"/r/mavros/global_position/compass_hdg": number}
+    (vehicle,) = find_vehicles([sensors | compass], ["bag"])
+    assert vehicle.topics["imu"] == next(iter(compass))
+    (vehicle,) = find_vehicles([sensors | compass | {"/r/mavros/imu/data": IMU}], ["bag"])
+    assert vehicle.topics["imu"] == "/r/mavros/imu/data"
+
+
 def test_a_topic_that_is_set_must_be_there_and_fit():
     with pytest.raises(DataError, match="no topic /auv_1/mavros/imu for its imu; there are /auv_"):
         find_vehicles([table("/auv_1")], ["bag"], settings_of(imu="mavros/imu"))

@@ -38,6 +38,8 @@ _GENERAL_TYPES = {
     "sensor_msgs/msg/PointCloud": 2,
     "sensor_msgs/msg/Image": 3,
     "sensor_msgs/msg/CompressedImage": 4,
+    "std_msgs/msg/Float64": 1,
+    "std_msgs/msg/Float32": 1,
     "geometry_msgs/msg/TwistWithCovarianceStamped": 1,
     "geometry_msgs/msg/TwistStamped": 2,
     "geometry_msgs/msg/Twist": 3,
@@ -57,11 +59,14 @@ NAMES_OF_ROLES = {
         "micron", "miniking", "ping", "scan", "points",
     ),
     "velocity": ("dvl", "velocity", "nucleus", "twist"),
-    "imu": ("imu", "ahrs"),
+    "imu": ("imu", "ahrs", "compass"),
     "depth": ("depth", "pressure", "baro"),
     "odometry": ("odometry", "odom", "ekf", "filtered", "pose", "localization"),
     "fix": ("fix", "usbl", "gps", "gnss", "navsat"),
 }  # fmt: skip
+_NUMBERS = {"std_msgs/msg/Float32", "std_msgs/msg/Float64"}
+_HEADINGS = ("compass", "heading", "hdg")
+"""What a number must be called to be a heading: an IMU has temperatures, too."""
 _TRUTH = {"truth", "ground_truth", "groundtruth", "gt"}
 # Words by which drivers are grouped; no vehicle has such a name.
 _GROUPS = {
@@ -238,12 +243,14 @@ def _candidates(table: Mapping[str, str], role: str, namespace: str) -> list[_Ra
         roles = roles_of_type(msgtype)
         if is_truth or role not in roles or _is_no_measurement(own):
             continue
-        words = NAMES_OF_ROLES[role]
+        words = _words(role, msgtype)
         if own == [words[0]] or (len(own) == 1 and own[0] in words):
             name = 0
         else:
             name = 1 if any(word in part for part in own for word in words) else 2
-        if name == 2 and (msgtype in _NEEDS_A_NAME or role != roles[0] or _is_named(own, roles)):
+        if name == 2 and (
+            msgtype in _NEEDS_A_NAME or role != roles[0] or _is_named(own, roles, msgtype)
+        ):
             continue
         is_raw = any("raw" in part or "debug" in part for part in own)
         found.append((_GENERAL_TYPES.get(msgtype, 0), name, len(own), int(is_raw), topic))
@@ -260,9 +267,16 @@ def _first_of_parts(tables: Sequence[Mapping[str, str]], names: Sequence[str]) -
     return names[bare[0]] if len(bare) > 1 and all(is_split) else ""
 
 
-def _is_named(parts: Sequence[str], roles: Sequence[str]) -> bool:
+def _words(role: str, msgtype: str) -> tuple[str, ...]:
+    """Words that name a role in topics of this type."""
+    if role == "imu" and msgtype in _NUMBERS:
+        return _HEADINGS
+    return NAMES_OF_ROLES.get(role, ())
+
+
+def _is_named(parts: Sequence[str], roles: Sequence[str], msgtype: str) -> bool:
     """Whether a topic's name says one of these roles."""
-    words = [word for role in roles for word in NAMES_OF_ROLES.get(role, ())]
+    words = [word for role in roles for word in _words(role, msgtype)]
     return any(word in part for part in parts for word in words)
 
 
@@ -285,7 +299,9 @@ def _namespaces(table: Mapping[str, str]) -> list[str]:
         parts = parts_of(topic)
         roles = {role for role in roles_of_type(msgtype) if role in _SENSORS}
         lowered = [part.lower() for part in parts]
-        is_nameless = msgtype in _NEEDS_A_NAME and not _is_named(lowered, tuple(roles))
+        if msgtype in _NUMBERS:
+            roles = {role for role in roles if _is_named(lowered, (role,), msgtype)}
+        is_nameless = msgtype in _NEEDS_A_NAME and not _is_named(lowered, tuple(roles), msgtype)
         if roles and not _TRUTH & set(lowered) and not _is_no_measurement(lowered):
             if is_nameless:
                 continue

@@ -251,8 +251,19 @@ def test_imu_without_rates_or_with_nothing():
         assert event.angular_velocity_rad_s is None
         assert event.yaw_rad == pytest.approx(2.0)
         assert read(IMU, imu(orientation_covariance=NONE, **changes)) == ()
+
+
+def test_quaternions_of_another_scale_are_read_and_those_of_any_norm_are_not():
+    told = []
+    settings = replace(SETTINGS, role="imu", memory={}, tell=told.append)
+    adapter = adapter_of(IMU)
+    for yaw in (0.4, -2.0):
+        q = quaternion(0, 0, 0.5 * math.sin(yaw / 2), 0.5 * math.cos(yaw / 2))
+        (event,) = adapter.read(imu(orientation=q), settings)
+        assert event.yaw_rad == pytest.approx(yaw)
+    assert [f.kind for f in told] == ["imu_quaternion_norm"]
     with pytest.raises(InvalidInputError, match="quaternion"):
-        read(IMU, imu(orientation=quaternion(0, 0, 0, 2)))
+        adapter.read(imu(orientation=quaternion(0, 0, 0, 0.7)), settings)
 
 
 PRESSURE = "sensor_msgs/msg/FluidPressure"
@@ -271,6 +282,8 @@ def pressure(value):
         (0.0, TEN_METRES_PA, "depth_gauge"),  # ten metres of it look absolute
         (-300.0, TEN_METRES_PA, "depth_gauge"),
         (1013.25, 1013.25 + TEN_METRES_PA / 100.0, "depth_mbar"),
+        (101.325, 101.325 + TEN_METRES_PA / 1000.0, "depth_kpa"),
+        (1.01325, 1.01325 + TEN_METRES_PA / 1e5, "depth_bar"),
     ],
 )
 def test_the_first_pressure_tells_the_convention(first, value, kind):
@@ -304,6 +317,17 @@ def test_depth_as_a_number():
         assert read(name, Msg(data=NAN)) == ()
         with pytest.raises(InvalidInputError, match="data is inf"):
             read(name, Msg(data=math.inf))
+
+
+@pytest.mark.parametrize(("degrees", "yaw_deg"), [(0.0, 90.0), (90.0, 0.0), (300.0, 150.0)])
+def test_a_heading_as_a_number_is_in_degrees_from_north(degrees, yaw_deg):
+    for name in ("std_msgs/msg/Float32", "std_msgs/msg/Float64"):
+        (event,) = read(name, Msg(data=degrees), role="imu")
+        assert event.yaw_rad == pytest.approx(math.radians(yaw_deg))
+        assert (event.stamp_ns, event.angular_velocity_rad_s) == (0, None)
+        assert read(name, Msg(data=NAN), role="imu") == ()
+        with pytest.raises(InvalidInputError, match="data is 1000"):
+            read(name, Msg(data=1000.0), role="imu")
 
 
 def with_covariance(diagonal, **kwargs):
