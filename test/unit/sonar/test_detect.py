@@ -14,6 +14,7 @@ from uw_dslam_ros2.core.sonar import (
     detections_from_points,
     detections_from_scan,
 )
+from uw_dslam_ros2.core.sonar.silence import silent_beams
 
 pytestmark = pytest.mark.kernels
 
@@ -247,3 +248,24 @@ def test_points_all_round_are_as_far_from_one_another_as_the_beams_of_a_turn():
     assert len(turn.points) == 120
     fan = detections_from_points(0, ring[np.abs(np.sin(0.5 * bearing)) < 0.5])
     assert fan.beamwidth_rad == 0.02
+
+
+@pytest.mark.parametrize("dead", [slice(0, 32), slice(40, 48), slice(63, 64)])
+def test_nothing_is_known_of_the_water_before_dead_receivers(rng, dead):
+    intensity = noisy(rng)
+    intensity[:, dead] = 7
+    expected = np.zeros(64, np.bool_)
+    expected[dead] = True
+    np.testing.assert_array_equal(silent_beams(intensity), expected)
+    found = detect(image(intensity))
+    assert (found.free_range_m[expected] == 0.0).all()
+    assert (found.free_range_m[~expected] > 5.0).all()
+
+
+def test_beams_without_an_echo_above_a_drivers_threshold_are_not_dead(rng):
+    intensity = noisy(rng)
+    assert not silent_beams(intensity).any()
+    assert not silent_beams(np.zeros_like(intensity)).any()
+    intensity[intensity < 16] = 0  # sparse specks are left
+    intensity[:, 50:] = 0
+    assert not silent_beams(intensity).any()

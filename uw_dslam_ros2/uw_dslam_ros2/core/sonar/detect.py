@@ -18,6 +18,7 @@ from uw_dslam_ros2.core.sonar.kernels import (
     select_returns,
     to_power,
 )
+from uw_dslam_ros2.core.sonar.silence import silent_beams
 from uw_dslam_ros2.core.sonar.types import Detections, SonarImage
 
 __all__ = [
@@ -201,6 +202,7 @@ def image_echoes(image: SonarImage, config: SonarConfig) -> BeamEchoes:
         range_m[first + np.maximum(first_above, 0)] - 0.5 * bin_m,
         _NO_ECHO_FREE_SHARE * range_m[last - 1],
     )
+    free_range_m[silent_beams(power)] = 0.0
     return BeamEchoes(
         beams,
         np.interp(first + bins, np.arange(len(range_m)), range_m),
