@@ -86,7 +86,9 @@ CASES = {
         imu(lambda _, yaw, rate: (yaw, np.degrees(rate))), {"imu_rates_in_degrees": True},
     ),
     "heading_disturbed": (imu(near_steel), {"imu_orientation": "none"}),
-    "imu_drift": (imu(lambda t, yaw, rate: (yaw + 0.004 * t, rate + 0.004)), {}),
+    "imu_drift": (
+        imu(lambda t, yaw, rate: (yaw + 0.004 * t, rate + 0.004)), {"imu_drift_rad_s": 0.004},
+    ),
     "dvl_sign": (dvl(lambda _, v: -v), {"velocity_yaw_offset_rad": math.pi}),
     "dvl_turned": (dvl(lambda _, v: turned(v, -0.8)), {"velocity_yaw_offset_rad": 0.8}),
     "dvl_mirrored": (dvl(lambda _, v: v * [1.0, -1.0]), {"velocity_is_mirrored": True}),
@@ -115,7 +117,11 @@ def test_the_cause_is_named_and_mended(recording, kind):
     assert set(changes) == set(mends)
     for name, value in mends.items():
         # This vehicle's speed hardly changes, and so hardly shows when it did.
-        tolerance = {"velocity_delay_s": 0.15, "sonar_range_scale": 0.015}.get(name, 0.03)
+        tolerance = {
+            "velocity_delay_s": 0.15,
+            "sonar_range_scale": 0.015,
+            "imu_drift_rad_s": 6e-4,
+        }.get(name, 0.03)
         assert changes[name] == pytest.approx(value, abs=tolerance)
 
 
@@ -251,6 +257,38 @@ def test_pixels_of_decibels_are_told_with_their_step(recording):
     found = examine(navigation, replace(pings, pixels="decibel", db_per_count=0.3789))
     assert [finding.kind for finding in found.findings] == ["sonar_decibel"]
     assert found.sonar_changes == {"intensity": "decibel", "db_per_count": 0.38}
+
+
+def test_beams_that_never_hold_anything_are_told_with_their_side(recording):
+    navigation, pings = recording
+    dead = replace(pings, silent_share=0.5, silent_rad=tuple(np.linspace(-1.0, 0.0, 64)))
+    (finding,) = examine(navigation, dead).findings
+    assert (finding.kind, finding.role) == ("sonar_silent_beams", "sonar")
+    assert "50 % of its beams, between 57 degrees to starboard" in finding.detail
+    few = replace(pings, silent_share=0.02, silent_rad=(0.1,))
+    assert examine(navigation, few).findings == []
+
+
+@pytest.mark.parametrize("rate", [0.004, -0.01])
+def test_a_steady_drift_is_mended_where_heading_and_rates_have_it(recording, rate):
+    both = imu(lambda t, yaw, r: (yaw + rate * t, r + rate))(*recording)
+    alone = imu(lambda _, yaw, r: (np.full_like(yaw, np.nan), r + rate))(*recording)
+    for navigation, pings in (both, alone):
+        found = examine(navigation, pings)
+        assert [finding.kind for finding in found.findings] == ["imu_drift"]
+        assert found.conventions.imu_drift_rad_s == pytest.approx(rate, abs=6e-4)
+    # Beside a heading that holds, rates with a bias are the filter's task.
+    held = imu(lambda _, yaw, r: (yaw, r + rate))(*recording)
+    assert examine(*held).findings == []
+
+
+def test_a_drift_that_comes_and_goes_is_told_and_not_mended(recording):
+    def late(t, yaw, rate):
+        return yaw + 0.02 * np.maximum(t - 30.0, 0.0), rate + 0.02 * (t > 30.0)
+
+    found = examine(*imu(late)(*recording))
+    assert [finding.kind for finding in found.findings] in (["imu_drift"], [])
+    assert found.conventions.changes() == {}
 
 
 def test_without_echoes_only_what_needs_none_is_said(recording):

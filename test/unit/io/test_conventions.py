@@ -1,6 +1,7 @@
 """Readings of other conventions, corrected, are those that were meant."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.sonar.types import SonarImage
 from uw_dslam_ros2.io.conventions import CorrectedMountings, correct
+from uw_dslam_ros2.io.feeding import feed
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
     ImageEvent,
@@ -146,3 +148,25 @@ def test_a_sonar_that_was_knocked_is_turned_from_then_on():
         conventions = Conventions(sonar_knocked_at_s=at_s, sonar_knocked_yaw_rad=0.3)
         turned = CorrectedMountings(conventions).of(image(), np.eye(4))
         assert math.atan2(turned[1, 0], turned[0, 0]) == pytest.approx(angle)
+
+
+def test_a_heading_that_drifts_is_turned_back_from_its_stamp_on():
+    conventions = Conventions(imu_drift_rad_s=0.01, imu_drift_since_s=60.0, imu_delay_s=20.0)
+    event = correct(imu(1.0), conventions)
+    assert (event.drift_rad_s, event.drift_rad) == pytest.approx((0.01, 0.2))
+    said = []
+    mapper = SimpleNamespace(
+        attitude_at=lambda _: None, add_attitude=lambda *_: None, add_imu=lambda *a: said.append(a)
+    )
+    plain = correct(imu(1.0), Conventions())
+    for mounting in (np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])):
+        for reading in (event, plain):
+            feed(mapper, reading, mounting)
+        (_, yaw, rate, _), (_, yaw_before, rate_before, _) = said[-2:]
+        assert yaw - yaw_before == pytest.approx(-0.2)
+        assert rate - rate_before == pytest.approx(-0.01)
+
+
+def test_bearings_are_scaled_about_the_middle_of_the_fan():
+    result = correct(image(), Conventions(sonar_bearing_scale=0.5, sonar_is_mirrored=True))
+    np.testing.assert_allclose(result.image.bearing_rad, [-0.25, 0.0, 0.2])

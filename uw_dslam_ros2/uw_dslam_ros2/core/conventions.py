@@ -32,6 +32,16 @@ class Conventions(Config):
     imu_delay_s: float = setting(
         0.0, -1e6, 1e6, "how much later than true the IMU's stamps are [s]"
     )
+    imu_drift_rad_s: float = setting(
+        0.0,
+        -0.1,
+        0.1,
+        "how fast its heading and its rates turn of their own, counter-clockwise seen from above "
+        "[rad/s]",
+    )
+    imu_drift_since_s: float = setting(
+        0.0, 0.0, 1e11, "stamp from which on the heading drifts [s]; what it is then is kept"
+    )
     velocity_yaw_offset_rad: float = setting(
         0.0, -3.2, 3.2, "turns the measured velocity, counter-clockwise seen from above [rad]"
     )
@@ -68,6 +78,9 @@ class Conventions(Config):
         0.0, -3.2, 3.2, "by how much it is turned then, counter-clockwise seen from above [rad]"
     )
     sonar_range_scale: float = setting(1.0, 0.1, 10.0, "factor on the ranges (sound speed)")
+    sonar_bearing_scale: float = setting(
+        1.0, 0.2, 5.0, "factor on the bearings of images and scans (the aperture is wrong)"
+    )
     sonar_delay_s: float = setting(
         0.0, -1e6, 1e6, "how much later than true the sonar's stamps are [s]"
     )

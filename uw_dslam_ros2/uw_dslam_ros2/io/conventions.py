@@ -122,11 +122,15 @@ def _imu(event: ImuEvent, conventions: Conventions) -> ImuEvent | None:
         rates = rates * np.array(axes) * unit
     if orientation is None and rates is None:
         return None
+    stamp_ns = _earlier(event.stamp_ns, conventions.imu_delay_s)
+    drift_rad_s = conventions.imu_drift_rad_s
     return replace(
         event,
-        stamp_ns=_earlier(event.stamp_ns, conventions.imu_delay_s),
+        stamp_ns=stamp_ns,
         orientation_xyzw=orientation,
         angular_velocity_rad_s=rates,
+        drift_rad=drift_rad_s * (stamp_ns * 1e-9 - conventions.imu_drift_since_s),
+        drift_rad_s=drift_rad_s,
     )
 
 
@@ -174,6 +178,7 @@ def _pose_in_enu(event: PoseEvent) -> PoseEvent:
 def _ping(event: _Ping, conventions: Conventions) -> _Ping:
     stamp_ns = _earlier(event.stamp_ns, conventions.sonar_delay_s)
     side = -1.0 if conventions.sonar_is_mirrored else 1.0
+    bearing_scale = side * conventions.sonar_bearing_scale
     scale = conventions.sonar_range_scale
     match event:
         case ImageEvent(image=image):
@@ -181,14 +186,14 @@ def _ping(event: _Ping, conventions: Conventions) -> _Ping:
                 image,
                 stamp_ns=stamp_ns,
                 range_m=image.range_m * scale,
-                bearing_rad=image.bearing_rad * side,
+                bearing_rad=image.bearing_rad * bearing_scale,
             )
             return replace(event, stamp_ns=stamp_ns, image=image)
         case ScanEvent():
             return replace(
                 event,
                 stamp_ns=stamp_ns,
-                angles_rad=event.angles_rad * side,
+                angles_rad=event.angles_rad * bearing_scale,
                 ranges_m=event.ranges_m * scale,
                 range_max_m=event.range_max_m * scale,
             )
@@ -201,7 +206,7 @@ def _ping(event: _Ping, conventions: Conventions) -> _Ping:
                 event,
                 stamp_ns=stamp_ns,
                 beam_stamp_ns=event.beam_stamp_ns - round(conventions.sonar_delay_s * 1e9),
-                bearing_rad=event.bearing_rad * side,
+                bearing_rad=event.bearing_rad * bearing_scale,
                 range_m=event.range_m * scale,
                 range_max_m=event.range_max_m * scale,
             )

@@ -177,10 +177,10 @@ def _feed_imu(mapper: VehicleMapper, event: ImuEvent, R_base_imu: FloatArray) ->
     turned = None if rates is None else R_base_imu @ rates
     if event.orientation_xyzw is not None:
         R_world_base = rotation_of_quaternion(event.orientation_xyzw) @ R_base_imu.T
-        yaw_rad = math.atan2(R_world_base[1, 0], R_world_base[0, 0])
+        yaw_rad = math.atan2(R_world_base[1, 0], R_world_base[0, 0]) - event.drift_rad
         R_level_base = level_rotation(R_world_base)
         mapper.add_attitude(event.stamp_ns, R_level_base)
         if turned is not None and R_level_base is not None:
             turned = R_level_base @ turned
-    rate_rad_s = None if turned is None else float(turned[2])
+    rate_rad_s = None if turned is None else float(turned[2]) - event.drift_rad_s
     mapper.add_imu(event.stamp_ns, yaw_rad, rate_rad_s, sigma_rad)

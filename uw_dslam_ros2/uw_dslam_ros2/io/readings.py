@@ -53,6 +53,8 @@ class ImuEvent:
     """Orientation [x, y, z, w] of the IMU's frame in the world, and rates (3,) in its own frame.
 
     None where the message has none; ``yaw_variance`` [rad^2] is None where it is unknown.
+    ``drift_rad`` of its heading and ``drift_rad_s`` of its rates, counter-clockwise seen from
+    above, are known not to be the vehicle's.
     """
 
     vehicle_id: str
@@ -61,6 +63,8 @@ class ImuEvent:
     orientation_xyzw: FloatArray | None
     yaw_variance: float | None
     angular_velocity_rad_s: FloatArray | None
+    drift_rad: float = 0.0
+    drift_rad_s: float = 0.0
 
     @property
     def yaw_rad(self) -> float | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from uw_dslam_ros2.core.sonar import (
     detections_from_points,
     detections_from_scan,
 )
+from uw_dslam_ros2.core.sonar.silence import silent_beams
 from uw_dslam_ros2.core.sonar.turning import beams_of_image, is_few_beams
 from uw_dslam_ros2.core.submap import Submap
 
@@ -33,6 +35,7 @@ __all__ = ["SampleCollector"]
 FloatArray = NDArray[np.float64]
 
 _NUM_SPECKLE_IMAGES = 20
+_MIN_IMAGES, _ALWAYS = 10, 0.9
 
 
 class SampleCollector:
@@ -53,6 +56,9 @@ class SampleCollector:
         self._T_base_sonar = SE2()
         self._tilt_rad = 0.0
         self._levels: list[FloatArray] = []
+        self._num_images = 0
+        self._num_beams = 0
+        self._silent: Counter[float] = Counter()
 
     @property
     def start_ns(self) -> int:
@@ -128,6 +134,9 @@ class SampleCollector:
             return self.add_beams(beams_of_image(image), T_base_sonar, projection)
         if len(self._levels) < _NUM_SPECKLE_IMAGES:
             self._levels.append(patch_levels(image.intensity))
+        self._num_images += 1
+        self._num_beams = len(image.bearing_rad)
+        self._silent.update(image.bearing_rad[silent_beams(image.intensity)].tolist())
         return self._add(detect(image, self._sonar), T_base_sonar, projection)
 
     def add_scan(
@@ -205,7 +214,17 @@ class SampleCollector:
             decibels_per_count(self._levels),
             self._tilt_rad,
             self.start_ns * 1e-9,
+            self._silent_share(),
+            self._silent_rad(),
         )
+
+    def _silent_rad(self) -> tuple[float, ...]:
+        """Bearings at which nearly no image holds anything, rising."""
+        least = max(_MIN_IMAGES, _ALWAYS * self._num_images)
+        return tuple(sorted(b for b, count in self._silent.items() if count >= least))
+
+    def _silent_share(self) -> float:
+        return len(self._silent_rad()) / max(1, self._num_beams)
 
     @property
     def is_turning(self) -> bool:

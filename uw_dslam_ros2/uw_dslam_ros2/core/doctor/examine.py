@@ -18,7 +18,12 @@ from uw_dslam_ros2.core.doctor.judging.images import judge_images
 from uw_dslam_ros2.core.doctor.judging.imu import ImuState, compare_yaw_and_rate
 from uw_dslam_ros2.core.doctor.judging.knocks import judge_knock
 from uw_dslam_ros2.core.doctor.judging.odometry import OdometrySample, examine_odometry
-from uw_dslam_ros2.core.doctor.judging.scales import confidence_in, judge_scale
+from uw_dslam_ros2.core.doctor.judging.scales import judge_scale
+from uw_dslam_ros2.core.doctor.judging.turn_errors import (
+    is_scale_of_turns_wrong,
+    judge_drift,
+    judge_scale_of_turns,
+)
 from uw_dslam_ros2.core.doctor.judging.turns_and_times import say_delays, say_one_flipped
 from uw_dslam_ros2.core.doctor.judging.velocities import (
     judge_offset,
@@ -28,13 +33,11 @@ from uw_dslam_ros2.core.doctor.judging.velocities import (
 from uw_dslam_ros2.core.doctor.motions.delays import find_delays
 from uw_dslam_ros2.core.doctor.motions.fits import (
     SURE,
-    TurnFit,
     VelocityFit,
     believed,
     confidence_of,
     fit_turns,
     fit_velocity,
-    turn_bias,
 )
 from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions, ping_motions
 from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample, PingSample
@@ -46,7 +49,6 @@ FloatArray = NDArray[np.float64]
 _LIKELY = 0.95  # enough to tell of a late dvl, not to correct it
 _MIN_MOTIONS = 15
 _MIN_READINGS = 20
-_MIN_DRIFT_RAD_S = math.radians(0.05)
 _UNIT_LOG = math.log(1.3)
 _MAX_WAY_COST = 1.5  # of a velocity that explains how the echoes move
 
@@ -125,16 +127,23 @@ class _Trial:
             orientation = believed(fit_turns(self._motions, imu_s, imu.by_orientation))
         fits = rates or orientation
         if fits is None:
+            judge_scale_of_turns(self._result, imu, self._motions, imu_s)
             return
         self._yaw = by_rates if rates else imu.by_orientation
         self._delay_s = fits[0].delay_s
+        assert self._yaw is not None
+        is_wrong = is_scale_of_turns_wrong(self._motions, imu_s, self._yaw, fits[0])
+        if is_wrong and judge_scale_of_turns(self._result, imu, self._motions, imu_s):
+            return
         apart_rad_s = 0.0
         if rates and orientation and self._result.conventions.imu_orientation != "none":
             assert imu.by_orientation is not None
             side = rates[0].sign * orientation[0].sign
             apart = by_rates - side * imu.by_orientation
             apart_rad_s = float((apart[-1] - apart[0]) / (imu_s[-1] - imu_s[0]))
-        self._judge_drift(fits[0], apart_rad_s)
+        judge_drift(
+            self._result, self._motions, imu_s, self._yaw, fits[0], apart_rad_s, self._start_s
+        )
         reading: _Reading | None = _Reading(fits[0].sign)
         if rates and orientation and rates[0].sign != orientation[0].sign:
             say_one_flipped(self._result, rates[0].sign, orientation[0].sign, orientation)
@@ -196,22 +205,6 @@ class _Trial:
             is_velocity_mirrored=reading.is_velocity_mirrored,
             is_velocity_in_world=reading.is_velocity_in_world,
             velocity_delay_s=velocity_delay_s,
-        )
-
-    def _judge_drift(self, fit: TurnFit, apart_rad_s: float) -> None:
-        """Tell of a heading that drifts, unless its orientation does so less by `apart_rad_s`."""
-        assert self._yaw is not None
-        bias, sigma = turn_bias(self._motions, self._navigation.imu_s, self._yaw, fit)
-        if abs(bias) < max(_MIN_DRIFT_RAD_S, 5.0 * sigma):
-            return
-        if abs(bias - apart_rad_s) < 0.5 * abs(bias):
-            return  # beside an orientation that holds, the mapper's filter finds the bias
-        self._result.tell(
-            "imu_drift",
-            "imu",
-            f"it turns by {60.0 * abs(math.degrees(bias)):.1f} degrees a minute where the sonar's "
-            "echoes do not: its gyro has a bias; let it settle before the dive, or calibrate it",
-            confidence_in(bias, sigma),
         )
 
     def _handedness(self) -> _Reading | None:

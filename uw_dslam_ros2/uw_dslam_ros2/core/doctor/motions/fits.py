@@ -22,8 +22,8 @@ __all__ = [
     "confidence_of_lead",
     "fit_turns",
     "fit_velocity",
-    "turn_bias",
     "turned",
+    "turns_of",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -94,9 +94,10 @@ def at_times(times_s: FloatArray, known_s: FloatArray, known: FloatArray) -> Flo
     return np.where(outside, np.nan, np.interp(times_s, known_s, known))
 
 
-def _turns(
+def turns_of(
     motions: PingMotions, imu_s: FloatArray, yaw_rad: FloatArray, delay_s: float
 ) -> FloatArray:
+    """By how much a yaw (K,) turns in each motion (M,); NaN where it is not known."""
     begin = at_times(motions.begin_s - delay_s, imu_s, yaw_rad)
     return at_times(motions.end_s - delay_s, imu_s, yaw_rad) - begin
 
@@ -109,7 +110,7 @@ def _robust(squares: FloatArray) -> FloatArray:
 def _turn_cost(
     motions: PingMotions, imu_s: FloatArray, yaw_rad: FloatArray, sign: int, delay_s: float
 ) -> FloatArray:
-    turns = sign * _turns(motions, imu_s, yaw_rad, delay_s)
+    turns = sign * turns_of(motions, imu_s, yaw_rad, delay_s)
     error = np.mod(motions.motion[:, 2] - turns + math.pi, 2.0 * math.pi) - math.pi
     return _robust(np.square(error / _YAW_FLOOR_RAD))
 
@@ -142,21 +143,6 @@ def believed(fits: list[TurnFit]) -> list[TurnFit] | None:
     if not len(best.cost) or float(np.mean(best.cost)) > _MAX_TURN_COST:
         return None
     return fits if confidence_of(best, other) > SURE else None
-
-
-def turn_bias(
-    motions: PingMotions, imu_s: FloatArray, yaw_rad: FloatArray, fit: TurnFit
-) -> tuple[float, float]:
-    """By how much faster than the echoes a yaw (K,) turns, and its standard deviation [rad/s]."""
-    turns = fit.sign * _turns(motions, imu_s, yaw_rad, fit.delay_s)
-    error = np.mod(turns - motions.motion[:, 2] + math.pi, 2.0 * math.pi) - math.pi
-    rates = (error / (motions.end_s - motions.begin_s))[np.isfinite(error)]
-    if len(rates) < 2:
-        return 0.0, math.inf
-    middle = float(np.median(rates))
-    # That of a median of normal values, by the median deviation.
-    spread = 1.48 * float(np.median(np.abs(rates - middle)))
-    return fit.sign * middle, 1.25 * spread / math.sqrt(len(rates) / motions.repeats)
 
 
 def fit_velocity(

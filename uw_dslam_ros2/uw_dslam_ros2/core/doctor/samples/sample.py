@@ -46,7 +46,8 @@ class PingSample:
     recording says that it sits. ``pixels`` is what images hold by their speckle (None: not
     known), ``pixels_read_as`` what they are taken for, ``db_per_count`` a step of decibels.
     ``tilt_rad`` is how far the middle of the fan looks up or down; the points are projected by it
-    already. ``start_s`` is the stamp that seconds are counted from.
+    already. ``start_s`` is the stamp that seconds are counted from. ``silent_rad`` are bearings,
+    rising, at which images never hold anything; they are ``silent_share`` of all beams.
     """
 
     stamp_s: FloatArray
@@ -57,6 +58,8 @@ class PingSample:
     db_per_count: float = 0.0
     tilt_rad: float = 0.0
     start_s: float = 0.0
+    silent_share: float = 0.0
+    silent_rad: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if (np.diff(self.stamp_s) < 0.0).any() or len(self.stamp_s) != len(self.points):
