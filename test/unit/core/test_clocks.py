@@ -151,3 +151,31 @@ def test_gaps_are_found_inside_and_at_the_ends():
     assert (gap.role, round(gap.seconds)) == ("imu", 30)
     (gap,) = find_gaps(truth | {"velocity": truth["velocity"][:-120]})
     assert (gap.role, round(gap.seconds)) == ("velocity", 20)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("same_stamps", lambda t: np.full_like(t, t[0])),
+        ("whole_seconds", lambda t: t // SECOND * SECOND),
+    ],
+)
+@pytest.mark.parametrize("role", ["sonar", "imu", "velocity"])
+def test_stamps_that_tell_no_time_are_replaced_by_those_of_recording(kind, change, role):
+    streams, truth = vehicle(**{role: change})
+    stamps, findings = corrected_clocks(streams)
+    assert [(f.kind, f.role) for f in findings] == [(kind, role)]
+    assert worst_s(stamps, truth) < 0.05
+
+
+@pytest.mark.parametrize("unit_ns", [1000, 1_000_000])
+def test_fractions_in_microseconds_or_milliseconds_are_read_as_such(unit_ns):
+    def change(t):
+        return t // SECOND * SECOND + t % SECOND // unit_ns
+
+    streams, truth = vehicle(imu=change)
+    stamps, findings = corrected_clocks(streams)
+    assert [(f.kind, f.role) for f in findings] == [("stamp_unit", "imu")]
+    assert worst_s(stamps, truth) < 0.0011
+    slow = {"imu": StreamTimes(*times(1.0))}  # one message a second, on the second
+    assert corrected_clocks(slow)[1] == []

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.findings import Finding
+from uw_dslam_ros2.core.stamp_fields import (
+    finding_of_unit,
+    in_unit,
+    unit_of_fractions,
+    why_useless,
+)
 
 __all__ = ["Gap", "StreamTimes", "corrected_clocks", "find_gaps"]
 
@@ -66,9 +72,14 @@ def corrected_clocks(
     the median difference. All of this is told.
     """
     streams = {role: times for role, times in streams.items() if len(times.stamp_ns)}
-    without = {role for role, times in streams.items() if _are_zero(times.stamp_ns)}
-    stamps = {r: t.stamp_ns.copy() for r, t in streams.items()}
     findings: list[Finding] = []
+    for role, times in streams.items():
+        if (unit_ns := unit_of_fractions(times.stamp_ns)) != 1:
+            streams[role] = replace(times, stamp_ns=in_unit(times.stamp_ns, unit_ns))
+            findings.append(finding_of_unit(role, unit_ns))
+    useless = {role: why_useless(times.stamp_ns) for role, times in streams.items()}
+    without = {role for role, (kind, _) in useless.items() if kind}
+    stamps = {r: t.stamp_ns.copy() for r, t in streams.items()}
     # A stamp of zero among others is a bad message, and says nothing of the clock.
     is_set = {role: times.stamp_ns > 0 for role, times in streams.items()}
     judged = {
@@ -87,17 +98,13 @@ def corrected_clocks(
         stamps[role] = streams[role].recorded_ns - (int(np.median(delays)) if delays else 0)
         findings.append(
             Finding(
-                "zero_stamps",
+                useless[role][0],
                 role,
-                "its stamps are zero; the times of recording are used instead, which come late by "
-                "an unknown delay: let the driver fill header.stamp",
+                f"its stamps {useless[role][1]}; the times of recording are used instead, which "
+                "come late by an unknown delay: let the driver fill header.stamp",
             )
         )
     return stamps, findings
-
-
-def _are_zero(stamp_ns: IntArray) -> bool:
-    return bool(np.mean(stamp_ns <= 0) > 0.5)
 
 
 def _delay_ns(times: StreamTimes, stamp_ns: IntArray) -> int:

@@ -313,3 +313,14 @@ def test_an_old_cloud_of_echoes():
     assert read(OLD, Msg(header=header(), points=[], channels=[])) == ()
     with pytest.raises(InvalidInputError, match=r"channels\[intensity\] has 1 values"):
         read(OLD, micron([1.0], channels=[Msg(name="intensity", values=[1.0])]))
+
+
+def test_a_scan_without_a_maximum_takes_the_longest_range():
+    settings = replace(SETTINGS, memory={})
+    adapter = adapter_of(LASER)
+    fan = {"angle_increment": 0.01, "time_increment": 0.0, "scan_time": 0.0, "range_max": 0.0}
+    assert adapter.read(scan([np.inf, np.nan, 0.0], range_min=0.1, **fan), settings) == ()
+    (first,) = adapter.read(scan([4.0, np.inf, 7.0], **fan), settings)
+    (second,) = adapter.read(scan([2.0, np.inf, 3.0], **fan), settings)
+    assert first.range_max_m == second.range_max_m == pytest.approx(7.0, rel=0.01)
+    assert first.range_max_m > 7.0

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
+from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io.drivers.adapter import Adapter, key_of, stamp_of
 from uw_dslam_ros2.io.drivers.settings import ReadSettings
 from uw_dslam_ros2.io.readings import BeamsEvent, ScanEvent
@@ -41,10 +42,13 @@ def read_scan(msg: Any, settings: ReadSettings) -> Sequence[ScanEvent | BeamsEve
     if len(ranges) == 0:
         return ()
     ranges[ranges < float(msg.range_min)] = np.nan
+    range_max_m = values[2] if values[2] > 0.0 else _farthest(ranges, settings)
+    if range_max_m == 0.0:
+        return ()
     angles = values[0] + values[1] * np.arange(len(ranges), dtype=np.float64)
     offset_s = _offsets(msg, settings, len(ranges))
     if len(ranges) > 1 and abs(offset_s[-1] - offset_s[0]) < ONE_MOMENT_S:
-        return (ScanEvent(*key_of(msg, settings), angles, ranges, values[2]),)
+        return (ScanEvent(*key_of(msg, settings), angles, ranges, range_max_m),)
     stamps = stamp_of(msg) + np.round(offset_s * 1e9).astype(np.int64)
     order = np.argsort(stamps, kind="stable")
     vehicle_id, _, frame_id = key_of(msg, settings)
@@ -56,9 +60,26 @@ def read_scan(msg: Any, settings: ReadSettings) -> Sequence[ScanEvent | BeamsEve
             stamps[order],
             angles[order],
             ranges[order],
-            values[2],
+            range_max_m,
         ),
     )
+
+
+def _farthest(ranges: FloatArray, settings: ReadSettings) -> float:
+    """The longest range [m] that this topic has had, where its messages say no maximum."""
+    # At the maximum itself there is no echo.
+    own = 1.001 * np.max(ranges, where=np.isfinite(ranges), initial=0.0)
+    found = max(settings.memory.get("farthest", 0.0), float(own))
+    settings.memory["farthest"] = found
+    settings.tell_once(
+        Finding(
+            "scan_range_max",
+            "sonar",
+            "its scans have no range_max: the longest range that it had so far is taken",
+            severity="info",
+        )
+    )
+    return found
 
 
 def _offsets(msg: Any, settings: ReadSettings, num_rays: int) -> FloatArray:

@@ -31,7 +31,8 @@ def judge_imu(result: Examination, imu: ImuState) -> None:
             "imu_no_orientation",
             "imu",
             f"its orientation never changes while its rates turn by {turned:.0f} degrees: the "
-            "driver does not fill it; use only the rates (conventions.imu_orientation: none)",
+            "driver does not fill it, or not in the order x, y, z, w; use only the rates "
+            "(conventions.imu_orientation: none)",
             imu_orientation="none",
         )
     if imu.are_rates_zero:
