@@ -1,5 +1,8 @@
 """A mapper that is killed and started again: what it kept is drawn anew as if it had gone on."""
 
+import dataclasses
+from contextlib import closing
+
 import numpy as np
 import pytest
 
@@ -9,7 +12,9 @@ from node.drives import Vehicle, drive, finish, mapper_of
 
 from uw_dslam_ros2.core.chart.redraw import redrawn
 from uw_dslam_ros2.core.mapping import OccupancyConfig
+from uw_dslam_ros2.io.sessions.kept_runs import KeptRuns
 from uw_dslam_ros2.ros.convert.core_types import submap_from_msg
+from uw_dslam_ros2.ros.mapper.run_keeper import RunKeeper
 
 pytestmark = pytest.mark.ros
 
@@ -72,9 +77,21 @@ def test_a_disk_that_takes_nothing_stops_no_mapping(ros_context, spinning, tmp_p
         until(lambda: "cannot write to the session" in vehicle.message(), "the complaint")
         vehicle.send_mount()
         drive(until, vehicle, range(4))
-        pipeline = mapper._pipeline
-        until(lambda: pipeline._runs.mapper.num_pings == 8, "the pings")
-        away.unlink()  # and it is back
-        mapper._worker.call(pipeline.close_last).result()
-        until(lambda: vehicle.submaps, "the submap")
-        assert list((away / "auv_1").glob("run_*"))
+        assert "1 submaps, 1 of them drawn anew" in finish(until, vehicle).message
+
+
+def test_what_the_disk_did_not_take_is_kept_when_it_is_back(killed, tmp_path):
+    _, (submap,), pings = killed
+    away, complaints = tmp_path / "disk", []
+    away.write_text("a file, and no folder")
+    keeper = RunKeeper(str(away / "auv_1"), _OCCUPANCY, complaints.append)
+    keeper.keep([submap], pings)
+    assert len(complaints) == 2
+    away.unlink()
+    keeper.keep([dataclasses.replace(submap, sequence=1)], pings)
+    keeper.close()
+    assert len(complaints) == 2
+    with closing(KeptRuns(away / "auv_1")) as kept:
+        found, found_pings = kept.load(*kept.earlier)
+    assert [s.sequence for s in found] == [0, 1]
+    assert len(found_pings[submap.submap_id]) == len(pings[submap.submap_id]) > 0

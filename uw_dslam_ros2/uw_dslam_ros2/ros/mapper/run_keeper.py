@@ -37,6 +37,7 @@ class RunKeeper:
     ) -> None:
         self._folder, self._config, self._complain = folder, config, complain
         self._runs: KeptRuns | None = None
+        self._unsaved: dict[SubmapId, Submap] = {}
         if folder:
             try:
                 self._runs = KeptRuns(folder)
@@ -48,13 +49,18 @@ class RunKeeper:
     def keep(
         self, submaps: Sequence[Submap], pings: Mapping[SubmapId, Sequence[DrawnPing]]
     ) -> None:
-        """Keep submaps that are about to be given away, with their pings."""
+        """Keep submaps that are about to be given away, with their pings.
+
+        Those that the disk did not take are tried again with the next.
+        """
         if not self._folder or not submaps:
             return
+        self._unsaved.update((submap.submap_id, submap) for submap in submaps)
         try:
             if self._runs is None:
-                self._runs = KeptRuns(self._folder)  # the disk may be back
-            self._runs.save(submaps, pings)
+                self._runs = KeptRuns(self._folder)
+            self._runs.save(list(self._unsaved.values()), pings)
+            self._unsaved.clear()
         except DataError as error:
             self._complain(str(error))
 
@@ -76,6 +82,7 @@ class RunKeeper:
 
     def forget_own(self) -> None:
         """What this process has mapped was drawn anew."""
+        self._unsaved.clear()
         if self._runs is not None:
             self._runs.forget_own()
 
