@@ -117,7 +117,10 @@ class MapperPipeline:
         if self._order.offer(stream, stamp_ns, event):
             self._begin_anew(stream, stamp_ns)
         if self.is_finished:
-            self._troubles.complain(f"mapping was finished; messages on {stream} are left out")
+            self._troubles.complain(
+                f"mapping was finished; messages on {stream} are left out until ~/reset begins a "
+                "new run"
+            )
             return
         if self._order.displaced.get(stream, 0) > _MANY_DISPLACED:
             self._troubles.complain(

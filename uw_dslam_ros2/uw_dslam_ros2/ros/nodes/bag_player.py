@@ -13,7 +13,6 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
-import rclpy
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -33,6 +32,7 @@ from uw_dslam_ros2.ros.plumbing.node_settings import BagPlayerConfig
 from uw_dslam_ros2.ros.plumbing.parameters import declare_config, refuse_unknown_parameters
 from uw_dslam_ros2.ros.plumbing.playback import Pacer
 from uw_dslam_ros2.ros.plumbing.qos import CLOCK, DEFAULT, PLAYBACK, STATIC_TF
+from uw_dslam_ros2.ros.plumbing.running import init_ros
 
 __all__ = ["BagPlayer", "BagPlayerConfig", "main"]
 
@@ -362,11 +362,11 @@ def _overrides(arguments: Sequence[str]) -> list[Parameter]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Play bags, then exit: 0 when all was played."""
     arguments = list(sys.argv if argv is None else argv)
-    overrides = _overrides(remove_ros_args(arguments)[1:])
-    rclpy.init(args=arguments)
+    if not init_ros("bag_player", arguments):
+        return 1
     node: BagPlayer | None = None
     try:
-        node = BagPlayer(parameter_overrides=overrides)
+        node = BagPlayer(parameter_overrides=_overrides(remove_ros_args(arguments)[1:]))
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin_until_future_complete(node.finished)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -14,16 +17,27 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import try_shutdown
+from rclpy.utilities import remove_ros_args, try_shutdown
 
 from uw_dslam_ros2.core.errors import UwDslamError
 from uw_dslam_ros2.ros.plumbing.heartbeat import Heartbeat
 
-__all__ = ["run_node", "run_nodes"]
+__all__ = ["init_ros", "run_node", "run_nodes"]
 
 _LOOK_UP_S = 0.2
 _END_WITHIN_S = 1.7
 """Launch files and service managers kill after a few seconds; by then we are gone."""
+
+
+def init_ros(name: str, argv: Sequence[str] | None, **options: Any) -> bool:
+    """Do what `rclpy.init` does; False: the arguments are wrong, and the log says why."""
+    try:
+        rclpy.init(args=None if argv is None else list(argv), **options)
+    except RuntimeError as error:  # base of all that rcl raises
+        # Where in rcl's own source it was found says nothing to who wrote the arguments.
+        get_logger(name).fatal(re.sub(r", at \S+:\d+", "", str(error)))
+        return False
+    return True
 
 
 def _let_callbacks_end(executor: MultiThreadedExecutor) -> None:
@@ -46,7 +60,19 @@ def _end_in_time(name: str, is_stopped: threading.Event) -> None:
 
 
 def run_node(name: str, make_node: Callable[[], Node], argv: Sequence[str] | None) -> int:
-    """Spin a node until SIGINT or SIGTERM; see `run_nodes`."""
+    """Spin a node until SIGINT or SIGTERM; see `run_nodes`.
+
+    Arguments that are not ROS's are refused: what was meant by them would be left out.
+    """
+    arguments = sys.argv[1:] if argv is None else argv
+    with contextlib.suppress(RuntimeError):  # which `init_ros` tells of
+        if own := remove_ros_args([name, *arguments])[1:]:
+            get_logger(name).fatal(
+                f"arguments {' '.join(own)} are none of ROS: those follow --ros-args, as in "
+                "--ros-args -r __ns:=/auv_1 -p name:=value --params-file FILE; docs/interfaces.md "
+                "lists the parameters"
+            )
+            return 1
     return run_nodes(name, [make_node], argv)
 
 
@@ -60,9 +86,8 @@ def run_nodes(
     ends the process with one sentence and code 1, not with a traceback. `name` is for the log.
     """
     # rclpy's own handlers would pull the context away under callbacks that still want to answer.
-    rclpy.init(
-        args=None if argv is None else list(argv), signal_handler_options=SignalHandlerOptions.NO
-    )
+    if not init_ros(name, argv, signal_handler_options=SignalHandlerOptions.NO):
+        return 1
     is_stopped = threading.Event()
 
     def stop(*_: Any) -> None:
