@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -95,6 +94,8 @@ def _keep_lines(
 
 def _surface(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Walls without the inside of filled bodies, which no echo comes from."""
+    import cv2  # large, so loaded when first used
+
     inside = cv2.erode(wall.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2)
     return wall & (inside == 0)
 
@@ -106,6 +107,8 @@ def clean_cells(occupancy: OccupancyMap) -> FilteredCells:
     unknown are decided by the majority of a neighbourhood. Algorithm 2's clustering filter, on
     cells instead of points.
     """
+    import cv2  # large, so loaded when first used
+
     values = occupancy.values
     wall = values >= _WALL_MIN_PERCENT
     offsets = _line_offsets()
@@ -130,6 +133,8 @@ def clean_cells(occupancy: OccupancyMap) -> FilteredCells:
 
 def _is_majority(mask: NDArray[np.bool_], border: int) -> NDArray[np.bool_]:
     """Whether most cells of the square around each cell are set."""
+    import cv2  # large, so loaded when first used
+
     size = (_MAJORITY_WIDTH_CELLS, _MAJORITY_WIDTH_CELLS)
     count = cv2.boxFilter(mask.view(np.uint8), -1, size, normalize=False, borderType=border)
     return count > _MAJORITY_WIDTH_CELLS**2 // 2

@@ -6,7 +6,6 @@ positions and not descriptors.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +25,8 @@ def orb_points(cells: FilteredCells, max_points: int) -> tuple[FloatArray, Float
     was seen beside it; those on the edge between known and unknown tell about the vehicle's path,
     not about the place. Weights are the corner responses, limited to twice their median.
     """
+    import cv2  # large, so loaded when first used
+
     image = np.full(cells.shape, _UNKNOWN_GREY, np.uint8)
     image[cells.free > 0.5] = _FREE_GREY
     is_wall = cells.wall > 0.25
@@ -46,5 +47,7 @@ def orb_points(cells: FilteredCells, max_points: int) -> tuple[FloatArray, Float
 
 
 def _near(is_wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    import cv2  # large, so loaded when first used
+
     size = 2 * _WALL_RADIUS_CELLS + 1
     return cv2.dilate(is_wall.astype(np.uint8), np.ones((size, size), np.uint8)) > 0

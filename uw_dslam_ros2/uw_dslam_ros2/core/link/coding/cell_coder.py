@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -93,6 +92,8 @@ def decode_marks(data: bytes, known: CellArray, is_open: BoolArray | None = None
 
 def near_cells(is_there: BoolArray) -> BoolArray:
     """Which cells (R, C) are at most two from one of those."""
+    import cv2  # large, so loaded when first used
+
     return cv2.dilate(is_there.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -103,6 +102,8 @@ def _summed(counts: NDArray[np.int32], factor: int) -> NDArray[np.int32]:
 
 def drop_specks(cells: CellArray) -> CellArray:
     """Without walls that stand alone, and with free and unknown cells as most around them are."""
+    import cv2  # large, so loaded when first used
+
     wall = cells == CELL_WALL
     _, labels, stats, _ = cv2.connectedComponentsWithStats(wall.astype(np.uint8), connectivity=8)
     is_kept = stats[:, cv2.CC_STAT_AREA] >= _MIN_WALL_CELLS
@@ -123,6 +124,8 @@ def blocks_of_known(cells: CellArray) -> NDArray[np.bool_]:
 
     What is called free and is not would contradict another map's walls.
     """
+    import cv2  # large, so loaded when first used
+
     rows, cols = cells.shape
     is_known = (cells != CELL_UNKNOWN).reshape(rows // 2, 2, cols // 2, 2).all(axis=(1, 3))
     return cv2.medianBlur(is_known.astype(np.uint8), 3) > 0
@@ -133,6 +136,8 @@ def seen_free(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
     Where what is free is told in large blocks, these are the far sides of walls.
     """
+    import cv2  # large, so loaded when first used
+
     wide = cv2.morphologyEx(
         free.astype(np.uint8),
         cv2.MORPH_OPEN,
@@ -156,6 +161,8 @@ def with_walls(known: CellArray, walls: NDArray[np.bool_]) -> CellArray:
     Of what was a wall and is none any more, that is free which free cells beside it reach; the far
     side of the wall is unknown. So are the cells next to a wall, as on a mapper's own map.
     """
+    import cv2  # large, so loaded when first used
+
     is_bare = (known == CELL_WALL) & ~walls
     free = ((known == CELL_FREE) & ~walls).astype(np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))

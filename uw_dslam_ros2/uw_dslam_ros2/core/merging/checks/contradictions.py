@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -158,6 +157,8 @@ def _contradicted_share(
 
 
 def _sketch(stored: StoredSubmap) -> _Sketch:
+    import cv2  # large, so loaded when first used
+
     spec, values = stored.submap.grid.spec, stored.submap.grid.values
     step = math.ceil(max(_CELL_M / spec.resolution_m - 0.5, VAGUE_CELLS))
     rows, cols = -(-spec.num_rows // step), -(-spec.num_cols // step)

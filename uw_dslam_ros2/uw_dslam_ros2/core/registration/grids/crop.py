@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,8 @@ def crop_to_known(occupancy: OccupancyMap) -> OccupancyMap:
 
     Specks inside that part stay. The map itself where nothing would be cut.
     """
+    import cv2  # large, so loaded when first used
+
     known = occupancy.known
     box = bounds_of(known)
     if box is None:

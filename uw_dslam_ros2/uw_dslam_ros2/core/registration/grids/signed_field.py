@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -21,6 +20,8 @@ PAD = 3
 
 def wall_distance(cells: FilteredCells) -> FloatGrid:
     """Distance (R, C) from cells to the nearest wall, in cells; infinite without any wall."""
+    import cv2  # large, so loaded when first used
+
     is_wall = cells.wall > 0.25
     if not is_wall.any():
         return np.full(cells.shape, np.inf, np.float32)
@@ -47,6 +48,8 @@ def signed_field(
     share of the neighbourhood, less as a wall comes near. ``sigma_cells`` is in cells of
     ``cells``; ``distance`` is `wall_distance` where it is known already.
     """
+    import cv2  # large, so loaded when first used
+
     if distance is None:
         distance = wall_distance(cells)
     free = cv2.boxFilter(cells.free, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,6 +53,8 @@ class WallMap:
     """
 
     def __init__(self, cells: FilteredCells, is_split: bool = False) -> None:
+        import cv2  # large, so loaded when first used
+
         self.cells, self.is_split = cells, is_split
         is_wall = cells.wall > 0.25
         self.distance = wall_distance(cells)
@@ -73,7 +74,7 @@ _NUM_LINES = 4
 _NUM_LINE_ANGLES = 120
 _LINE_HALF_WIDTH_CELLS = 2.5
 _LEAST_SPLIT_THICKNESS = 2.0  # of a wall of half cells
-_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _MOST_LINE_POINTS = 1500
 _NEAR_CELLS = 2.5
 _FAR_CELLS = 3.5
@@ -119,6 +120,8 @@ def measure_agreement(source: WallMap, target: WallMap, T_target_source: SE2) ->
 
 def _mean_thickness(is_wall: NDArray[np.bool_]) -> float:
     """Cells of the walls (R, C) over half of those at their rims, 2 at least."""
+    import cv2  # large, so loaded when first used
+
     inner = cv2.erode(is_wall.astype(np.uint8), _CROSS, borderType=cv2.BORDER_CONSTANT)
     num_walls = int(np.count_nonzero(is_wall))
     return 2.0 * num_walls / max(num_walls - int(np.count_nonzero(inner)), 1)
@@ -137,6 +140,8 @@ def _detail_share(points: FloatArray, half_width: float) -> float:
 
 def _common_area(source: WallMap, target: WallMap, T_target_source: SE2) -> tuple[float, float]:
     """Area seen by both over the smaller seen area, and the share of it that is near a wall."""
+    import cv2  # large, so loaded when first used
+
     rows, cols = target.seen.shape
     matrix = T_target_source.matrix()[:2].copy()
     matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts from cell centres
