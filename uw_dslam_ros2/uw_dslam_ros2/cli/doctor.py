@@ -186,8 +186,8 @@ def _left_open(
     ):
         yield (
             "velocity",
-            "too few of the sonar's motions lie within its messages, so its axes, unit and delay "
-            "cannot be told",
+            "too few of the sonar's motions lie within its messages and agree with the imu, so "
+            "its axes, unit and delay cannot be told",
         )
 
 

@@ -18,9 +18,10 @@ class Conventions(Config):
 
     imu_orientation: str = setting(
         "enu",
-        choices=("enu", "ned", "none"),
+        choices=("enu", "ned", "wxyz", "none"),
         doc="orientation of the IMU: enu (of a forward-left-up body in east-north-up, as ROS has "
-        "it), ned (of a forward-right-down body in north-east-down) or none (it says nothing)",
+        "it), ned (of a forward-right-down body in north-east-down), wxyz (enu, but with w in "
+        "the field x and so on) or none (it says nothing)",
     )
     imu_rates: str = setting(
         "flu",
@@ -31,6 +32,12 @@ class Conventions(Config):
     imu_rates_in_degrees: bool = setting(False, doc="its rates are in degrees per second")
     imu_delay_s: float = setting(
         0.0, -1e6, 1e6, "how much later than true the IMU's stamps are [s]"
+    )
+    imu_roll_rad: float = setting(
+        0.0, -3.2, 3.2, "turns the IMU on its mounting about the vehicle's forward axis [rad]"
+    )
+    imu_pitch_rad: float = setting(
+        0.0, -3.2, 3.2, "turns it then about the vehicle's axis to port [rad]"
     )
     imu_drift_rad_s: float = setting(
         0.0,

@@ -21,6 +21,7 @@ __all__ = [
     "fan_tilt",
     "level_rotation",
     "rotation_of_quaternion",
+    "rotation_of_roll_pitch",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -51,6 +52,17 @@ def rotation_of_quaternion(quaternion: ArrayLike) -> FloatArray:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def rotation_of_roll_pitch(roll_rad: float, pitch_rad: float) -> FloatArray:
+    """Rotation matrix (3, 3) about x, and then about y."""
+    cr, sr, cp, sp = (
+        math.cos(roll_rad),
+        math.sin(roll_rad),
+        math.cos(pitch_rad),
+        math.sin(pitch_rad),
+    )
+    return np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

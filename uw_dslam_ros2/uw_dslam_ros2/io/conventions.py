@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.conventions import Conventions
-from uw_dslam_ros2.core.mounting import rotation_of_quaternion
+from uw_dslam_ros2.core.mounting import rotation_of_quaternion, rotation_of_roll_pitch
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.io.readings import (
     BeamsEvent,
@@ -72,6 +72,7 @@ class CorrectedMountings:
         """
         conventions = self._conventions
         if isinstance(event, ImuEvent):
+            T_base_sensor = self._of_imu(T_base_sensor)
             self._note_heading(event, T_base_sensor[:3, :3])
         yaw_rad, side = 0.0, 1.0
         if isinstance(event, VelocityEvent):
@@ -94,6 +95,14 @@ class CorrectedMountings:
         turned[:3, :3] = turn @ T_base_sensor[:3, :3]
         return turned
 
+    def _of_imu(self, T_base_imu: FloatArray) -> FloatArray:
+        roll, pitch = self._conventions.imu_roll_rad, self._conventions.imu_pitch_rad
+        if roll == 0.0 and pitch == 0.0:
+            return T_base_imu
+        turned = T_base_imu.copy()
+        turned[:3, :3] = rotation_of_roll_pitch(roll, pitch) @ T_base_imu[:3, :3]
+        return turned
+
     def _note_heading(self, event: ImuEvent, R_base_imu: FloatArray) -> None:
         if event.orientation_xyzw is None:
             return
@@ -112,6 +121,8 @@ def _imu(event: ImuEvent, conventions: Conventions) -> ImuEvent | None:
     orientation, rates = event.orientation_xyzw, event.angular_velocity_rad_s
     if conventions.imu_orientation == "none":
         orientation = None
+    elif conventions.imu_orientation == "wxyz" and orientation is not None:
+        orientation = np.roll(orientation, -1)
     elif conventions.imu_orientation == "ned" and orientation is not None:
         orientation = _product(_product(_Q_ENU_NED, tuple(orientation)), _Q_FRD_FLU)
     if conventions.imu_rates == "none":

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, SampleCollector, examine
+from uw_dslam_ros2.core.doctor.judging.lean import Lean
 from uw_dslam_ros2.core.doctor.motions.ping_motion import have_echoes
 from uw_dslam_ros2.core.doctor.samples.bursts import choose_pings, more_pings
 from uw_dslam_ros2.core.doctor.turning.verdict import choose_spans, examine_turning
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.sonar import SonarConfig
-from uw_dslam_ros2.io.conventions import CorrectedMountings
+from uw_dslam_ros2.io.conventions import CorrectedMountings, correct
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.feeding import feed
 from uw_dslam_ros2.io.readings import (
     Event,
+    ImuEvent,
     PoseEvent,
     Reading,
     TransformEvent,
@@ -79,7 +82,8 @@ def examine_readings(
     vehicle_id: str = "",
 ) -> Examination:
     """Try the conventions of a vehicle's sensors; parameters as in `examine_recording`."""
-    collector = SampleCollector(sonar)
+    collector, leaning = SampleCollector(sonar), Lean()
+    changes: dict[str, Any] = {}
     is_axis_open = False
 
     def collect(is_wanted: IsWanted) -> None:
@@ -89,10 +93,21 @@ def examine_readings(
             if isinstance(event, TruthEvent | TransformEvent):
                 continue
             try:
+                if changes and isinstance(event, ImuEvent):
+                    ordered = correct(event, Conventions(**changes))
+                    if ordered is None:
+                        continue
+                    event = ordered
                 mounting = corrected.of(event, mounting_of(event))
                 if mounting is None:
                     continue
                 is_axis_open |= _is_axis_open(event, mounting)
+                if (
+                    not changes
+                    and isinstance(event, ImuEvent)
+                    and event.orientation_xyzw is not None
+                ):
+                    leaning.add(event.orientation_xyzw, mounting[:3, :3])
                 feed(collector, event, mounting)  # type: ignore[arg-type]  # has a mapper's inputs
                 if isinstance(event, PoseEvent):
                     collector.note_frame(event.frame_id, event.height_m)
@@ -100,6 +115,10 @@ def examine_readings(
                 continue  # mapping says what is wrong with it
 
     collect(lambda role, _: role in ("imu", "velocity", "odometry"))
+    if changes := leaning.changes():
+        conventions = Conventions(**(conventions.to_dict() | changes))
+        collector = SampleCollector(sonar)
+        collect(lambda role, _: role in ("imu", "velocity", "odometry"))
     navigation, odometry = collector.navigation(), collector.odometry()
     turn_s, rates = navigation.imu_s, navigation.yaw_rate_rad_s
     if not len(turn_s):
@@ -116,6 +135,7 @@ def examine_readings(
             more = {int(stamp_ns) for stamp_ns in ping_ns[further]} - wanted
             collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in more)
     found = examine(collector.navigation(), collector.pings(), vehicle_id, odometry)
+    leaning.tell(found)
     if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):
         found.is_turning = True
         spans = choose_spans(navigation, collector.seconds(np.unique(stamps["sonar"])))

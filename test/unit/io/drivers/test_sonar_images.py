@@ -165,6 +165,18 @@ def test_raw_image_of_a_gemini():
     assert read(name, raw(rx_angles=[], image=image_data([], 0)), by_beam) == ()
 
 
+def test_angles_of_a_raw_image_that_go_beyond_a_turn_are_degrees():
+    told = []
+    settings = replace(SETTINGS, data_order="beam_major", memory={}, tell=told.append)
+    angles = np.degrees([-PORT, -STARBOARD])
+    for _ in range(2):
+        (event,) = adapter_of("marine_acoustic_msgs/msg/RawSonarImage").read(
+            raw(rx_angles=angles), settings
+        )
+        target_at(30.0, 3.95, event)
+    assert [finding.kind for finding in told] == ["sonar_angle_unit"]
+
+
 def ensta(rows, *, has_gains=False, size=1, before=b"", **changes):
     data = np.frombuffer(before + rows.tobytes(), np.uint8)
     fields = {

@@ -31,6 +31,12 @@ _MILLIMETRES = Finding(
     "its ranges go beyond 2000: they are taken for millimetres, where the message has metres; "
     "mend the driver",
 )
+_DEGREES = Finding(
+    "sonar_angle_unit",
+    "sonar",
+    "its rx_angles go beyond a turn: they are taken for degrees, where the message has radians; "
+    "mend the driver",
+)
 _BY_BEAM = Finding(
     "sonar_data_order",
     "sonar",
@@ -98,6 +104,9 @@ def read_raw(msg: Any, settings: ReadSettings) -> Sequence[ImageEvent]:
     for name, value in (("sample_rate", rate_hz), ("ping_info.sound_speed", sound_speed_m_s)):
         if not (np.isfinite(value) and value > 0.0):
             raise InvalidInputError(f"{name} is {value}, expected a positive number")
+    if np.abs(bearing_rad).max() > 2.0 * np.pi:
+        settings.tell_once(_DEGREES)
+        bearing_rad = np.radians(bearing_rad)
     samples = float(msg.sample0) + np.arange(num_samples, dtype=np.float64) + 0.5
     range_m = samples / rate_hz * sound_speed_m_s / 2.0
     return (_image_event(msg, settings, range_m, bearing_rad, None),)
