@@ -7,6 +7,7 @@ import pytest
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination
+from uw_dslam_ros2.core.doctor.examination import ScaleEstimate
 from uw_dslam_ros2.core.doctor.judging.lean import Lean
 from uw_dslam_ros2.core.mounting import rotation_of_quaternion
 from uw_dslam_ros2.io.conventions import CorrectedMountings, correct
@@ -75,10 +76,29 @@ def test_a_quaternion_that_begins_with_w_is_read_so():
 
 
 def test_nothing_is_said_of_a_vehicle_that_leans_little_or_as_tf_says():
-    assert found_of(turned_by([0, 1, 0], 0.5)).findings == []
+    assert found_of(turned_by([0, 1, 0], 0.2)).findings == []
     upside_down = np.diag([1.0, -1.0, -1.0])
     assert found_of(turned_by([1, 0, 0], math.pi), upside_down).findings == []
     assert found_of(turned_by([1, 0, 0], math.pi)[:5]).findings == []
+
+
+@pytest.mark.parametrize(("ratio", "is_mended"), [(1.01, True), (1.13, False), (None, False)])
+def test_a_slight_lean_is_mended_only_where_the_echoes_move_as_a_level_vehicles(ratio, is_mended):
+    lean = Lean()
+    for q in turned_by([0, 1, 0], math.radians(20.0)):
+        lean.add(q, np.eye(3))
+    assert lean.changes() == {}
+    found = Examination()
+    found.scale = None if ratio is None else ScaleEstimate(ratio, 0.003, "velocity")
+    lean.tell_slight(found)
+    assert [f.kind for f in found.findings] == ["imu_leans"]
+    expected = {"imu_pitch_rad": pytest.approx(math.radians(20.0), abs=1e-3)} if is_mended else {}
+    assert found.conventions.changes() == expected
+    level = Lean()
+    for q in turned_by([0, 1, 0], math.radians(8.0)):
+        level.add(q, np.eye(3))
+    level.tell_slight(found)
+    assert len(found.findings) == 1
 
 
 def test_orientations_that_tumble_are_not_used(rng):

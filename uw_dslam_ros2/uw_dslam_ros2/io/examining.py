@@ -136,6 +136,7 @@ def examine_readings(
             collect(lambda role, stamp_ns: role == "sonar" and stamp_ns in more)
     found = examine(collector.navigation(), collector.pings(), vehicle_id, odometry)
     leaning.tell(found)
+    leaning.tell_slight(found)
     if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):
         found.is_turning = True
         spans = choose_spans(navigation, collector.seconds(np.unique(stamps["sonar"])))

@@ -16,6 +16,8 @@ FloatArray = NDArray[np.float64]
 
 _MIN_ORIENTATIONS = 20
 _MIN_LEAN_RAD = math.radians(60.0)  # a vehicle that is at work leans less
+_SLIGHT_RAD = math.radians(12.0)
+_MIN_EXCESS = 0.06  # three times what a speed of sound is usually wrong by
 _LEVEL_RAD = math.radians(20.0)
 _ALWAYS = 0.97  # of the mean of unit vectors, within 14 degrees of one another
 
@@ -47,9 +49,39 @@ class Lean:
         if float(np.linalg.norm(up)) < _ALWAYS:
             is_ordered = _leans(self._up(1)) < _LEVEL_RAD
             return {"imu_orientation": "wxyz" if is_ordered else "none"}
-        roll = math.atan2(up[1], up[2])
-        pitch = -math.atan2(up[0], math.hypot(up[1], up[2]))
-        return {"imu_roll_rad": round(roll, 3), "imu_pitch_rad": round(pitch, 3)}
+        return _upright(up)
+
+    def tell_slight(self, result: Examination) -> None:
+        """Tell of a vehicle that leans a little all the time; mend it where it really does not.
+
+        One that pitches shows walls farther away than they are, and its velocity ahead is less
+        than its way: by both, echoes would move farther than the DVL says.
+        """
+        if len(self._orientations) < _MIN_ORIENTATIONS:
+            return
+        up = self._up().mean(axis=0)
+        lean_rad = math.acos(float(np.clip(up[2], -1.0, 1.0)))
+        is_steady = float(np.linalg.norm(up)) > _ALWAYS
+        if not is_steady or not _SLIGHT_RAD < lean_rad < _MIN_LEAN_RAD:
+            return
+        changes = _upright(up)
+        mend = ", ".join(f"conventions.{name}: {value}" for name, value in changes.items())
+        excess = 1.0 / math.cos(changes["imu_pitch_rad"]) ** 2 - 1.0
+        scale = result.scale
+        is_level = (
+            scale is not None
+            and scale.by == "velocity"
+            and excess > _MIN_EXCESS
+            and abs(scale.ratio - 1.0) + 2.0 * scale.sigma < 0.5 * excess
+        )
+        why = "yet its echoes move as those of a level one:" if is_level else "if it does not,"
+        result.tell(
+            "imu_leans",
+            "imu",
+            f"by its orientation the vehicle leans by {math.degrees(lean_rad):.0f} degrees all "
+            f"the time; {why} it is the imu that leans, and tf does not say so ({mend})",
+            **(changes if is_level else {}),
+        )
 
     def tell(self, result: Examination) -> None:
         """Say so before all else, with what mends it."""
@@ -71,6 +103,13 @@ class Lean:
             **changes,
         )
         result.findings.insert(0, result.findings.pop())  # others may follow from it
+
+
+def _upright(up: FloatArray) -> dict[str, Any]:
+    """Conventions that turn a direction (3,) upwards."""
+    roll = math.atan2(up[1], up[2])
+    pitch = -math.atan2(up[0], math.hypot(up[1], up[2]))
+    return {"imu_roll_rad": round(roll, 3) + 0.0, "imu_pitch_rad": round(pitch, 3) + 0.0}
 
 
 def _leans(up: FloatArray) -> float:
