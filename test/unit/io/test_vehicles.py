@@ -5,6 +5,7 @@ from unit.io.bag_messages import SECOND
 
 from uw_dslam_ros2.core.errors import ConfigError, DataError
 from uw_dslam_ros2.io.bags import BagWriter
+from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.io.vehicles import find_recordings
 
@@ -46,6 +47,21 @@ def test_two_at_one_time_are_two_vehicles_named_after_their_bags(tmp_path):
     named, findings = find_recordings([], named={"p": [bags[0]], "s": [bags[1]]})
     assert [r.vehicle_id for r in named] == ["p", "s"]
     assert findings == []
+
+
+def test_two_recorders_of_one_vehicle_that_ran_at_one_time_are_one_vehicle(tmp_path):
+    bags = [write(tmp_path / "a", 10, 60), write(tmp_path / "b", 60, 110)]
+    again = write(tmp_path / "c", 60, 80)
+    for second in (bags[1], again):
+        (recording,), findings = find_recordings([bags[0], second])
+        assert (recording.vehicle_id, recording.bags) == ("auv_1", (bags[0], second))
+        assert findings == []
+    (recording,), findings = find_recordings([*bags, again])
+    assert len(recording.bags) == 3
+    with VehicleReader(recording) as reader:
+        reader.check_clocks()
+        assert len(list(reader.events())) == 4  # at 10, 60, 80 and 110 s
+        assert reader.counts["imu"].num_repeated == 2
 
 
 def test_names_that_cannot_be(tmp_path):

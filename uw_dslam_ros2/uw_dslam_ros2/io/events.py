@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import heapq
 import struct
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -56,6 +57,8 @@ __all__ = [
 _SECOND_NS = 1_000_000_000
 _MAX_MOUNTINGS = 200
 """Messages of /tf that are read for mountings: it goes on at a high rate, and repeats them."""
+_RECENT = 4
+"""Messages of a sensor that may be recorded again, by another recorder."""
 _TRUTH = "truth"
 
 
@@ -221,7 +224,7 @@ class VehicleReader:
         each message before it is read.
         """
         number = dict.fromkeys(self._recording.topics, 0)
-        last: dict[str, bytes] = {}
+        last = {role: deque[bytes](maxlen=_RECENT) for role in self._recording.topics}
         frozen = FrozenSensors()
         for index, raw in merged(self._readers, self._sensor_topics()):
             role = self._roles[raw.topic]
@@ -229,10 +232,10 @@ class VehicleReader:
             count.num += 1
             position = number[role]
             number[role] += 1
-            if last.get(role) == raw.data and _stamp_of(self._readers[index], raw) > 0:
+            if raw.data in last[role] and _stamp_of(self._readers[index], raw) > 0:
                 count.num_repeated += 1  # a message that was recorded twice says nothing new
                 continue
-            last[role] = raw.data
+            last[role].append(raw.data)
             stamp_ns = int(self.stamps[role][position]) if role in self.stamps else None
             if is_wanted is not None and not is_wanted(role, stamp_ns):
                 continue

@@ -18,6 +18,9 @@ __all__ = ["VehicleRecording", "find_recordings", "recordings_of"]
 _MAX_PAUSE_NS = 30_000_000_000
 """A vehicle that was restarted sooner than this is where it was; later, it may be anywhere."""
 
+_UNSTAMPED = {"std_msgs/msg"}
+"""Packages whose messages have no stamp, so that two of different times may be alike."""
+
 
 @dataclass(frozen=True, slots=True)
 class VehicleRecording:
@@ -189,7 +192,9 @@ def _by_time(
         sensors = set(vehicle.topics.values()) & set(bag.topics)
         end_ns = max(other.end_ns for other in groups[-1])
         is_same = any(sensors & set(b.topics) for b in groups[-1] if b.end_ns > bag.start_ns)
-        if is_same:
+        if is_same and _repeats(bag, groups[-1], sensors):
+            groups[-1].append(bag)
+        elif is_same:
             is_overlapping = True
             groups.append([bag])
         elif bag.start_ns - end_ns > _MAX_PAUSE_NS:
@@ -220,6 +225,22 @@ def _by_time(
         )
         for name, group in zip(names, groups, strict=True)
     ]
+
+
+def _repeats(bag: _Bag, earlier: Sequence[_Bag], topics: set[str]) -> bool:
+    """Whether a bag's first message with a stamp is in an earlier one: two recorders ran."""
+    stamped = sorted(t for t in topics if bag.topics[t].rpartition("/")[0] not in _UNSTAMPED)
+    if not stamped:
+        return False
+    with open_bag(bag.path) as reader:
+        first = next(iter(reader.raw(stamped)), None)
+    for other in earlier:
+        if first is None or first.topic not in other.topics:
+            continue
+        with open_bag(other.path) as reader:
+            if any(raw.data == first.data for raw in reader.raw([first.topic])):
+                return True
+    return False
 
 
 def _names(
