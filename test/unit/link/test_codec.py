@@ -13,6 +13,7 @@ from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
 from uw_dslam_ros2.core.link import Layer, LayeredSubmap, encode_submap, read_outline
 from uw_dslam_ros2.core.link.coding.cells import blocks_of_known, seen_free, with_walls
 from uw_dslam_ros2.core.metrics import interpolate_poses, resample
+from uw_dslam_ros2.core.mosaic import fuse_maps
 from uw_dslam_ros2.core.se2 import SE2
 
 COVARIANCE = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.0004]])
@@ -129,6 +130,23 @@ def test_finer_layers_show_the_walls_that_the_map_has():
     is_wall = resample(got, submap().grid.spec) > 50
     assert np.mean(is_wall[values > 50]) > 0.95
     assert np.mean(values[is_wall] > 50) > 0.95
+
+
+@pytest.mark.parametrize("layer", [Layer.COARSE, Layer.FINE])
+def test_a_wall_outlives_the_free_water_of_one_other_submap_and_not_of_two(layer):
+    water = np.where(submap().grid.values > 50, np.int8(0), submap().grid.values)
+    bare = submap(grid=OccupancyMap(submap().grid.spec, water))
+    walls, free = (
+        received(layer, layers=encode_submap(one)).submap("auv_1").grid for one in (submap(), bare)
+    )
+    lattice = GridSpec(walls.spec.resolution_m, 1, 1)
+    for num_free in (1, 2):
+        fused = fuse_maps(lattice, [(walls, SE2()), *[(free, SE2())] * num_free], 8.0)
+        is_wall = resample(fused, walls.spec) > 60
+        is_contested = (walls.values > 50) & (resample(free, walls.spec) >= 0)
+        assert is_contested.sum() > 50
+        assert is_wall[is_contested].all() == (num_free == 1)
+        assert is_wall[is_contested].any() == (num_free == 1)
 
 
 def test_a_pose_that_moved_costs_an_outline_and_no_cells():
@@ -263,7 +281,7 @@ def test_noise_is_refused(data):
 
 def test_another_version_is_refused():
     other = bytes([LAYERS[Layer.COARSE][0] + 4]) + LAYERS[Layer.COARSE][1:]
-    with pytest.raises(InvalidInputError, match="version of the codec is 5, expected 4"):
+    with pytest.raises(InvalidInputError, match="version of the codec is 6, expected 5"):
         LayeredSubmap().add(other)
 
 

@@ -28,8 +28,10 @@ __all__ = [
     "with_walls",
 ]
 
-# As sure as a mapper is of a cell that it saw often.
-_FREE_PERCENT, _WALL_PERCENT = 5, 95
+# A wall is as sure as a mapper is of one that it saw often. Free water, whose border is told in
+# blocks, is less so: where submaps are laid on each other the free water of one must not take the
+# walls of another away.
+_FREE_PERCENT, _WALL_PERCENT = 15, 95
 _WALL_MIN_PERCENT = 60
 _FREE_MAX_PERCENT = 40
 _MAX_BARE_CELLS = 3  # from a coarse wall's side to the true wall

@@ -9,8 +9,8 @@ from uw_dslam_ros2.core.link.coding.fields import ByteReader, ByteWriter
 
 __all__ = ["CODEC_VERSION", "Layer", "begun", "head_of"]
 
-CODEC_VERSION = 4
-"""Of layers; others are refused."""
+CODEC_VERSION = 5
+"""Of layers, and of what is drawn of them; others are refused."""
 
 
 class Layer(enum.IntEnum):
