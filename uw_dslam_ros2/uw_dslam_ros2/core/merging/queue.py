@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.merging.asking.plan import Plan
 from uw_dslam_ros2.core.merging.config import MapQueueConfig
 from uw_dslam_ros2.core.merging.drawn.trajectories import Trajectory, trajectories_of
 from uw_dslam_ros2.core.merging.graph.answers import Answer, Query, QueryKey
@@ -124,18 +125,8 @@ class MapQueue(SteeredQueue):
 
     def submaps(self) -> list[SubmapRecord]:
         """All submaps, by vehicle, run and sequence."""
-        answers = list(self._answers.values())
-        plan, library = self._plan(), self._now.library()
-        return records_of(
-            self._submaps,
-            self._decisions.withdrawn(self._submaps),
-            plan,
-            self._now.frame.anchor,
-            answers,
-            self._now.planning.aside,
-            self._now.undrawable(plan),
-            [decision.edge() for decision in library.confirmed],
-        )
+        plan = self._plan()
+        return list(self._now.once("submaps", lambda: self._records(plan)))
 
     def take_notices(self) -> list[str]:
         """What a person should know of, since the last call: frames that moved."""
@@ -186,7 +177,20 @@ class MapQueue(SteeredQueue):
 
     def map_digest(self) -> bytes:
         """Of what the global map is drawn from (8 bytes): who has the same has the same map."""
-        return self._now.digest(self._plan())
+        plan = self._plan()
+        return self._now.once("digest", lambda: self._now.digest(plan))
+
+    def _records(self, plan: Plan) -> list[SubmapRecord]:
+        return records_of(
+            self._submaps,
+            self._decisions.withdrawn(self._submaps),
+            plan,
+            self._now.frame.anchor,
+            list(self._answers.values()),
+            self._now.planning.aside,
+            self._now.undrawable(plan),
+            [decision.edge() for decision in self._now.library().confirmed],
+        )
 
     def maps_of(self, query: Query) -> tuple[OccupancyMap, OccupancyMap]:
         """Source and target of a question, whose submaps are held."""
@@ -196,7 +200,8 @@ class MapQueue(SteeredQueue):
     def constraints(self) -> list[Constraint]:
         """All edges of the pose graph with what is left of them after optimisation."""
         plan = self._plan()
-        return constraints_of(plan, [d.edge() for d in self._now.library().confirmed])
+        confirmed = [decision.edge() for decision in self._now.library().confirmed]
+        return list(self._now.once("constraints", lambda: constraints_of(plan, confirmed)))
 
     def loops(self) -> list[LoopError]:
         """Cycles of three and more submaps in the graph, and by how much each fails to close."""
@@ -204,9 +209,8 @@ class MapQueue(SteeredQueue):
         from uw_dslam_ros2.core.merging.graph.solving import loop_errors
 
         plan = self._plan()
-        return loop_errors(
-            plan.odometry, [constraint for constraint in plan.constraints if constraint.is_inlier]
-        )
+        held = [constraint for constraint in plan.constraints if constraint.is_inlier]
+        return list(self._now.once("loops", lambda: loop_errors(plan.odometry, held)))
 
     def global_map(self) -> OccupancyMap | None:
         """The fused map in frame "map"; None before there is any evidence."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from typing import Any
 
 from uw_dslam_ros2.core.merging.arrivals import Arrivals
 from uw_dslam_ros2.core.merging.asking.plan import Plan
@@ -43,7 +45,7 @@ class Standing:
         self.drawing = Drawing()
         self._library: Library | None = None
         self._plan: Plan | None = None
-        self._digest: bytes | None = None
+        self._worked_out: dict[str, Any] = {}
 
     def set_decisions(self, log: DecisionLog, *, keeps: bool) -> None:
         """Have another log; `keeps`: what stood because of the one before goes on to stand."""
@@ -61,7 +63,8 @@ class Standing:
 
     def change(self) -> None:
         """Something changed."""
-        self._plan = self._digest = None
+        self._plan = None
+        self._worked_out.clear()
         self.drawing.note_change()
 
     def library(self) -> Library:
@@ -122,17 +125,22 @@ class Standing:
         withdrawn = self.decisions.withdrawn(merged)
         return self.drawing.drawn(lattice, self._arrivals.submaps, merged, withdrawn)
 
+    def once[T](self, what: str, work_out: Callable[[], T]) -> T:
+        """What follows from the plan and all else, worked out once between two changes."""
+        if what not in self._worked_out:
+            self._worked_out[what] = work_out()
+        found: T = self._worked_out[what]
+        return found
+
     def digest(self, plan: Plan) -> bytes:
-        """Of what the map is drawn from (8 bytes); worked out once between two changes."""
-        if self._digest is None:
-            merged = self.merged(plan)
-            withdrawn = self.decisions.withdrawn(merged)
-            hasher = hashlib.blake2b(repr(self.frame.lattice).encode(), digest_size=8)
-            for submap_id, T in sorted(merged.items()):
-                hasher.update(repr((submap_id, submap_id in withdrawn, *T.as_array())).encode())
-                hasher.update(self._arrivals.submaps[submap_id].fingerprint)
-            self._digest = hasher.digest()
-        return self._digest
+        """Of what the map is drawn from (8 bytes)."""
+        merged = self.merged(plan)
+        withdrawn = self.decisions.withdrawn(merged)
+        hasher = hashlib.blake2b(repr(self.frame.lattice).encode(), digest_size=8)
+        for submap_id, T in sorted(merged.items()):
+            hasher.update(repr((submap_id, submap_id in withdrawn, *T.as_array())).encode())
+            hasher.update(self._arrivals.submaps[submap_id].fingerprint)
+        return hasher.digest()
 
     def _sound(self, library: Library) -> dict[SubmapId, StoredSubmap]:
         """What the frame may be pinned to."""

@@ -1,4 +1,4 @@
-"""By its digest each manager says what its map is drawn from."""
+"""What a queue tells follows from what it holds now: the map's digest, places, edges and loops."""
 
 import dataclasses
 
@@ -30,12 +30,31 @@ def changes(queue):
     yield queue.forget_answers("auv_3")
 
 
-def test_it_is_that_of_a_queue_that_never_gave_one_before():
+def told(queue):
+    """What else follows from the submaps and answers, as text."""
+    records = [
+        (
+            r.submap.submap_id,
+            r.submap.revision,
+            r.state,
+            r.component,
+            r.T_component_submap,
+            r.reason,
+        )
+        for r in queue.submaps()
+    ]
+    edges = [(c.kind, c.source, c.target, c.is_inlier, c.residual_m) for c in queue.constraints()]
+    return repr((records, edges, queue.loops()))
+
+
+def test_all_is_as_a_queue_tells_it_that_never_told_before():
     queue, seen = MapQueue(), {}
     for _ in changes(queue):
         digest = queue.map_digest()
         assert queue.map_digest() is digest, "worked out once between two changes"
-        assert MapQueue.from_state(queue.to_state()).map_digest() == digest
+        again = MapQueue.from_state(queue.to_state())
+        assert again.map_digest() == digest
+        assert told(again) == told(queue)
         # Equal digests, equal maps.
         assert seen.setdefault(digest, map_bytes(queue)) == map_bytes(queue)
     assert len(seen) > 5
