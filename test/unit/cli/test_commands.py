@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +94,25 @@ def test_errors_and_interrupts_have_exit_codes(capsys: pytest.CaptureFixture[str
     assert common.run_command("name", refuse) == 2
     assert common.run_command("name", interrupt) == 130
     assert capsys.readouterr().err == "name: error: file x is broken\nname: interrupted\n"
+
+
+def test_output_that_nobody_reads_to_its_end_is_no_error() -> None:
+    program = (
+        "import sys; from uw_dslam_ros2.cli.common import run_command\n"
+        "def talk():\n"
+        "    for k in range(200_000): print(k)\n"
+        "    return 0\n"
+        "sys.exit(run_command('name', talk))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == b"0\n"
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 141
 
 
 # --- evaluate --------------------------------------------------------------------------------

@@ -387,7 +387,8 @@ def test_too_large_an_image_is_refused_by_its_header_alone(tmp_path, kind, monke
 
 @pytest.mark.parametrize("free_thresh", [0.196, 0.25])
 @pytest.mark.parametrize("keys", [{}, {"mode": "scale"}, {"mode": "raw"}, {"negate": 1}])
-def test_unknown_that_reads_as_free_is_told(tmp_path, free_thresh, keys):
+def test_a_grey_for_unknown_that_is_free_by_rule_is_told(tmp_path, free_thresh, keys):
+    """nav2's map saver wrote such files; where white is free, their grey is not."""
     said: list[str] = []
     path = write_pgm(tmp_path, PIXELS_TOP_DOWN, free_thresh=free_thresh, **keys)
     occupancy = read_map(path, said.append)
@@ -395,8 +396,18 @@ def test_unknown_that_reads_as_free_is_told(tmp_path, free_thresh, keys):
         assert not said
         return
     (sentence,) = said
-    assert "free_thresh is 0.25, so the 3 pixels of grey 205" in sentence
-    np.testing.assert_array_equal(occupancy.values, np.where(VALUES < 0, 0, VALUES))
+    assert "free_thresh is 0.25, which makes the 3 pixels of grey 205 free" in sentence
+    is_scale = "mode" in keys
+    assert f"read as {'free' if is_scale else 'unknown'}" in sentence
+    expected = np.where(VALUES < 0, 0, VALUES) if is_scale else VALUES
+    np.testing.assert_array_equal(occupancy.values, expected)
+
+
+def test_a_grey_that_may_be_free_is_free_where_nothing_else_is(tmp_path):
+    said: list[str] = []
+    occupancy = read_map(write_pgm(tmp_path, [[205, 0]], free_thresh=0.25), said.append)
+    np.testing.assert_array_equal(occupancy.values, [[0, 100]])
+    assert "read as free" in said[0]
 
 
 def test_a_map_without_grey_205_is_not_warned_of(tmp_path):

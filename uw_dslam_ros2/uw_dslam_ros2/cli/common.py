@@ -34,6 +34,7 @@ EXIT_NOTHING_MADE = 1
 EXIT_BAD_INPUT = 2
 """Exit code for wrong usage, files and settings; argparse uses the same."""
 _EXIT_INTERRUPTED = 130
+_EXIT_BROKEN_PIPE = 141  # as of programs that the signal ends
 _LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "scikit-learn")
 
 
@@ -53,7 +54,13 @@ def run_command(name: str, command: Callable[[], int]) -> int:
     The exit code is 2 then, or 1 where nothing could be made of good input.
     """
     try:
-        return command()
+        code = command()
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # Who reads the output has seen enough, as `| head` does; Python would try again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _EXIT_BROKEN_PIPE
     except UwDslamError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return EXIT_NOTHING_MADE if isinstance(error, NothingMappedError) else EXIT_BAD_INPUT

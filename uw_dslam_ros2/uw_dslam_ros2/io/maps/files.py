@@ -28,6 +28,7 @@ _OCCUPIED_THRESH = 0.65
 _FREE_THRESH = 0.196
 _PIXEL_OCCUPIED, _PIXEL_FREE, _PIXEL_UNKNOWN = 0, 254, 205
 _RAW_UNKNOWN = 255
+_LEAST_OF_THREE_GREYS = 0.95  # of a saver's map that somebody has drawn in
 _PERCENT = np.append(np.arange(OCCUPIED + 1), UNKNOWN)
 _SHADES = np.where(_PERCENT < 0, _PIXEL_UNKNOWN, np.rint(254.0 * (1.0 - _PERCENT / 100.0))).astype(
     np.uint8
@@ -107,7 +108,8 @@ def read_map(
     ----------
     yaml_path
         The YAML file. Everything that nav2's map_server takes is taken: modes in any case, numbers
-        in quotes, words for `negate`, tabs, more documents, and comments in any encoding.
+        in quotes, words for `negate`, tabs, more documents, and comments in any encoding. But grey
+        205 beside black and white alone is unknown, also where `free_thresh` makes it free.
     on_warning
         Is told in a sentence what can be read, but was probably not meant.
 
@@ -126,12 +128,22 @@ def read_map(
     values = table[total]
     if header.mode == "scale" and is_opaque is not None:
         values[~is_opaque] = UNKNOWN
-    if on_warning is not None and (num := _num_free_unknown(header, total, len(table) - 1)):
-        on_warning(
-            f"{path}: free_thresh is {header.free_thresh}, so the {num} pixels of grey "
-            f"{_PIXEL_UNKNOWN}, which map savers write for unknown, are read as free; write "
-            f"free_thresh: {_FREE_THRESH} if they are unknown"
-        )
+    is_doubtful = _is_free_unknown(header, total, len(table) - 1)
+    if num := int(np.count_nonzero(is_doubtful)):
+        is_saved = header.mode == "trinary" and _has_three_greys(total, len(table) - 1)
+        if is_saved:
+            values[is_doubtful] = UNKNOWN
+        if on_warning is not None:
+            on_warning(
+                f"{path}: free_thresh is {header.free_thresh}, which makes the {num} pixels of "
+                f"grey {_PIXEL_UNKNOWN} free, but that is what map savers write for unknown; "
+                + (
+                    "as the others are black and white, they are read as unknown; write "
+                    if is_saved
+                    else "they are read as free; if they are unknown, write "
+                )
+                + f"free_thresh: {_FREE_THRESH}"
+            )
     grid = np.ascontiguousarray(np.flipud(values))
     spec = GridSpec(header.resolution_m, grid.shape[0], grid.shape[1], header.T_frame_grid)
     return OccupancyMap(spec, grid)
@@ -178,13 +190,26 @@ def _sums_of(
     return channels.sum(axis=2, dtype=np.uint32), channels.shape[2], is_opaque
 
 
-def _num_free_unknown(header: MapHeader, total: NDArray[np.uint32], white: int) -> int:
-    """How many pixels have the grey that savers write for unknown, but are read as free."""
+def _is_free_unknown(
+    header: MapHeader, total: NDArray[np.uint32], white: int
+) -> NDArray[np.bool_]:
+    """Which pixels (R, C) have the grey that savers write for unknown, but are free by rule.
+
+    nav2's map saver used to write both that grey and a threshold that makes it free
+    (ros-navigation/navigation2, pull request 5278, mended in June 2025).
+    """
     is_free = header.free_thresh > 1.0 - _PIXEL_UNKNOWN / 255.0
     grey, rest = divmod(_PIXEL_UNKNOWN * white, 255)
     if header.mode == "raw" or header.negate or not is_free or rest:
-        return 0
-    return int(np.count_nonzero(total == grey))
+        return np.zeros(total.shape, np.bool_)
+    return total == grey
+
+
+def _has_three_greys(total: NDArray[np.uint32], white: int) -> bool:
+    """Whether nearly all is black, white, or a saver's grey, and white is there."""
+    greys = np.array([_PIXEL_OCCUPIED, _PIXEL_UNKNOWN, _PIXEL_FREE, 255]) * white // 255
+    count = [np.count_nonzero(total == grey) for grey in greys]
+    return bool(sum(count[2:]) > 0 and sum(count) >= _LEAST_OF_THREE_GREYS * total.size)
 
 
 def _looked_up(occupancy: OccupancyMap, table: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
