@@ -125,14 +125,11 @@ def read_map(
     total, num_channels, is_opaque = _sums_of(image, average_alpha=header.mode == "trinary")
     # A table of all sums of channels that there can be, instead of arithmetic for each pixel.
     table = _values_of(np.arange(num_channels * white + 1) / (num_channels * white), header)
-    values = table[total]
-    if header.mode == "scale" and is_opaque is not None:
-        values[~is_opaque] = UNKNOWN
-    is_doubtful = _is_free_unknown(header, total, len(table) - 1)
-    if num := int(np.count_nonzero(is_doubtful)):
+    grey = _free_unknown_grey(header, len(table) - 1)
+    if grey is not None and (num := int(np.count_nonzero(total == grey))):
         is_saved = header.mode == "trinary" and _has_three_greys(total, len(table) - 1)
         if is_saved:
-            values[is_doubtful] = UNKNOWN
+            table[grey] = UNKNOWN
         if on_warning is not None:
             on_warning(
                 f"{path}: free_thresh is {header.free_thresh}, which makes the {num} pixels of "
@@ -144,6 +141,9 @@ def read_map(
                 )
                 + f"free_thresh: {_FREE_THRESH}"
             )
+    values = table[total]
+    if header.mode == "scale" and is_opaque is not None:
+        values[~is_opaque] = UNKNOWN
     grid = np.ascontiguousarray(np.flipud(values))
     spec = GridSpec(header.resolution_m, grid.shape[0], grid.shape[1], header.T_frame_grid)
     return OccupancyMap(spec, grid)
@@ -190,10 +190,8 @@ def _sums_of(
     return channels.sum(axis=2, dtype=np.uint32), channels.shape[2], is_opaque
 
 
-def _is_free_unknown(
-    header: MapHeader, total: NDArray[np.uint32], white: int
-) -> NDArray[np.bool_]:
-    """Which pixels (R, C) have the grey that savers write for unknown, but are free by rule.
+def _free_unknown_grey(header: MapHeader, white: int) -> int | None:
+    """Sum of channels of the grey that savers write for unknown, where that is free by rule.
 
     nav2's map saver used to write both that grey and a threshold that makes it free
     (ros-navigation/navigation2, pull request 5278, mended in June 2025).
@@ -201,8 +199,8 @@ def _is_free_unknown(
     is_free = header.free_thresh > 1.0 - _PIXEL_UNKNOWN / 255.0
     grey, rest = divmod(_PIXEL_UNKNOWN * white, 255)
     if header.mode == "raw" or header.negate or not is_free or rest:
-        return np.zeros(total.shape, np.bool_)
-    return total == grey
+        return None
+    return grey
 
 
 def _has_three_greys(total: NDArray[np.uint32], white: int) -> bool:
