@@ -139,10 +139,8 @@ class OpenSection:
         self.num_pings += 1
         if self._is_due(stamp_ns, T_submap_base):
             self._last_mapped = (stamp_ns, T_submap_base)
-            T_submap_sonar = T_submap_base @ T_base_sonar
-            T_dead_sonar = T_dead_base @ T_base_sonar if T_dead_base is not None else None
-            self._draw(detections, T_submap_sonar, T_dead_sonar)
-            self._keep(detections, T_submap_sonar, detections.is_turn)
+            self._draw(detections, T_submap_base, T_dead_base, T_base_sonar)
+            self._keep(detections, T_submap_base @ T_base_sonar, detections.is_turn)
 
     def add_sweep(
         self, sweep: PlacedSweep, T_submap_reference: SE2, T_dead_reference: SE2 | None
@@ -152,9 +150,9 @@ class OpenSection:
             self._go_on(int(stamp_ns), T_submap_reference @ SE2.from_array(pose))
         self.num_pings += 1
         for part in sweep.slices:
-            T_part = part.T_reference_sonar
-            T_dead_sonar = T_dead_reference @ T_part if T_dead_reference is not None else None
-            self._draw(part.detections, T_submap_reference @ T_part, T_dead_sonar)
+            self._draw(
+                part.detections, T_submap_reference, T_dead_reference, part.T_reference_sonar
+            )
         self._keep(sweep.detections, T_submap_reference, is_turn=True)
 
     def _go_on(self, stamp_ns: int, T_submap_base: SE2) -> None:
@@ -164,9 +162,17 @@ class OpenSection:
         self._trajectory.append((T_submap_base.x, T_submap_base.y, T_submap_base.yaw))
         self._stamps_ns.append(stamp_ns)
 
-    def _draw(self, detections: Detections, T_submap_sonar: SE2, T_dead_sonar: SE2 | None) -> None:
+    def _draw(
+        self,
+        detections: Detections,
+        T_submap_frame: SE2,
+        T_dead_frame: SE2 | None,
+        T_frame_sonar: SE2,
+    ) -> None:
+        T_submap_sonar = T_submap_frame @ T_frame_sonar
         self.grid.add(detections, T_submap_sonar)
         if self._watch is not None:
+            T_dead_sonar = None if T_dead_frame is None else T_dead_frame @ T_frame_sonar
             self._watch(detections, T_submap_sonar, T_dead_sonar)
 
     def _keep(self, detections: Detections, T_submap_sonar: SE2, is_turn: bool) -> None:
