@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.findings import Finding
 
-__all__ = ["Examination", "ScaleEstimate"]
+__all__ = ["Examination", "ScaleEstimate", "words_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,3 +66,9 @@ class Examination:
     ) -> None:
         """Name a cause of this vehicle; see `Finding` and `add`."""
         self.add(Finding(kind, role, detail, confidence, vehicle_id=self.vehicle_id), **changes)
+
+
+def words_of(changes: Mapping[str, str | float | bool]) -> str:
+    """Conventions as lines of settings, for a sentence."""
+    words = {k: str(v).lower() if isinstance(v, bool) else v for k, v in changes.items()}
+    return ", ".join(f"conventions.{name}: {value}" for name, value in words.items())

@@ -40,6 +40,7 @@ from uw_dslam_ros2.core.doctor.motions.fits import (
     fit_velocity,
 )
 from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions, ping_motions
+from uw_dslam_ros2.core.doctor.motions.turn_errors import fit_turn_errors
 from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample, PingSample
 
 __all__ = ["examine"]
@@ -132,8 +133,10 @@ class _Trial:
         self._yaw = by_rates if rates else imu.by_orientation
         self._delay_s = fits[0].delay_s
         assert self._yaw is not None
-        is_wrong = is_scale_of_turns_wrong(self._motions, imu_s, self._yaw, fits[0])
-        if is_wrong and judge_scale_of_turns(self._result, imu, self._motions, imu_s):
+        errors = fit_turn_errors(self._motions, imu_s, self._yaw, fits[0])
+        if is_scale_of_turns_wrong(errors) and judge_scale_of_turns(
+            self._result, imu, self._motions, imu_s
+        ):
             return
         apart_rad_s = 0.0
         if rates and orientation and self._result.conventions.imu_orientation != "none":
@@ -142,8 +145,9 @@ class _Trial:
             apart = by_rates - side * imu.by_orientation
             apart_rad_s = float((apart[-1] - apart[0]) / (imu_s[-1] - imu_s[0]))
         judge_drift(
-            self._result, self._motions, imu_s, self._yaw, fits[0], apart_rad_s, self._start_s
-        )
+            self._result, self._motions, imu_s, self._yaw, fits[0], errors, apart_rad_s,
+            self._start_s,
+        )  # fmt: skip
         reading: _Reading | None = _Reading(fits[0].sign)
         if rates and orientation and rates[0].sign != orientation[0].sign:
             say_one_flipped(self._result, rates[0].sign, orientation[0].sign, orientation)

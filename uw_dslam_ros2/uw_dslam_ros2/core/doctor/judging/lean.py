@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.examination import Examination
+from uw_dslam_ros2.core.doctor.examination import Examination, words_of
 
 __all__ = ["Lean"]
 
@@ -65,7 +65,7 @@ class Lean:
         if not is_steady or not _SLIGHT_RAD < lean_rad < _MIN_LEAN_RAD:
             return
         changes = _upright(up)
-        mend = ", ".join(f"conventions.{name}: {value}" for name, value in changes.items())
+        mend = words_of(changes)
         excess = 1.0 / math.cos(changes["imu_pitch_rad"]) ** 2 - 1.0
         scale = result.scale
         is_level = (
@@ -88,7 +88,7 @@ class Lean:
         changes = self.changes()
         if not changes:
             return
-        mend = ", ".join(f"conventions.{name}: {value}" for name, value in changes.items())
+        mend = words_of(changes)
         lean = math.degrees(_leans(self._up()))
         if changes.get("imu_orientation") == "wxyz":
             why = "and turns about an axis that lies: its quaternion begins with w"

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.examination import Examination
+from uw_dslam_ros2.core.doctor.examination import Examination, words_of
 from uw_dslam_ros2.core.doctor.judging.imu import ImuState
 from uw_dslam_ros2.core.doctor.judging.scales import confidence_in
 from uw_dslam_ros2.core.doctor.motions.fits import (
@@ -18,7 +18,11 @@ from uw_dslam_ros2.core.doctor.motions.fits import (
     fit_turns,
 )
 from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions
-from uw_dslam_ros2.core.doctor.motions.turn_errors import fit_turn_errors, fit_turn_scale
+from uw_dslam_ros2.core.doctor.motions.turn_errors import (
+    TurnErrors,
+    fit_turn_errors,
+    fit_turn_scale,
+)
 
 __all__ = ["is_scale_of_turns_wrong", "judge_drift", "judge_scale_of_turns"]
 
@@ -36,6 +40,7 @@ def judge_drift(
     imu_s: FloatArray,
     yaw_rad: FloatArray,
     fit: TurnFit,
+    errors: TurnErrors,
     apart_rad_s: float,
     start_s: float,
 ) -> None:
@@ -43,11 +48,10 @@ def judge_drift(
 
     Parameters
     ----------
-    yaw_rad : (K,) at ``imu_s`` (K,), not wrapped, that turns as `fit` says.
+    yaw_rad : (K,) at ``imu_s`` (K,), not wrapped, that turns as `fit` and `errors` say.
     apart_rad_s : by how much faster than the orientation it drifts.
     start_s : stamp that the times are counted from.
     """
-    errors = fit_turn_errors(motions, imu_s, yaw_rad, fit)
     bias, sigma = errors.bias_rad_s, errors.bias_sigma_rad_s
     if abs(bias) < max(_MIN_DRIFT_RAD_S, 5.0 * sigma):
         return
@@ -62,8 +66,7 @@ def judge_drift(
             "imu_drift_rad_s": float(f"{drift:.3g}"),
             "imu_drift_since_s": round(start_s, 2),
         }
-        words = ", ".join(f"conventions.{name}: {value}" for name, value in changes.items())
-        mend += f" ({words})"
+        mend += f" ({words_of(changes)})"
     result.tell(
         "imu_drift",
         "imu",
@@ -90,11 +93,8 @@ def _is_steady(
     return True
 
 
-def is_scale_of_turns_wrong(
-    motions: PingMotions, imu_s: FloatArray, yaw_rad: FloatArray, fit: TurnFit
-) -> bool:
-    """Whether the echoes clearly do not turn as far as a yaw (K,) that fits otherwise."""
-    errors = fit_turn_errors(motions, imu_s, yaw_rad, fit)
+def is_scale_of_turns_wrong(errors: TurnErrors) -> bool:
+    """Whether the echoes clearly do not turn as far as a yaw that fits otherwise."""
     return abs(errors.scale - 1.0) > max(_MIN_APERTURE_ERROR, 6.0 * errors.scale_sigma)
 
 

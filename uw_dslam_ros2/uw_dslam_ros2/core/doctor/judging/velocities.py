@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.examination import Examination
+from uw_dslam_ros2.core.doctor.examination import Examination, words_of
 from uw_dslam_ros2.core.doctor.judging.scales import confidence_in
 from uw_dslam_ros2.core.doctor.motions.fits import VelocityFit
 
@@ -90,11 +90,10 @@ def say_in_world(result: Examination, fit: VelocityFit | None, confidence: float
     }
     if fit.is_mirrored:
         changes["velocity_is_mirrored"] = True
-    words = ", ".join(f"conventions.{name}: {value}" for name, value in changes.items())
     result.tell(
         "dvl_in_world",
         "velocity",
-        f"{said} ({words.replace('True', 'true')})",
+        f"{said} ({words_of(changes)})",
         confidence,
         **changes,
     )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.motions.fits import TurnFit, fit_turns, turns_of
 from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions
+from uw_dslam_ros2.core.se2 import wrap_angle
 
 __all__ = ["TurnErrors", "fit_turn_errors", "fit_turn_scale"]
 
@@ -38,7 +39,7 @@ def fit_turn_errors(
 ) -> TurnErrors:
     """What a yaw (K,), not wrapped, turns by where the echoes do not."""
     turns = fit.sign * turns_of(motions, imu_s, yaw_rad, fit.delay_s)
-    error = np.mod(turns - motions.motion[:, 2] + math.pi, 2.0 * math.pi) - math.pi
+    error = wrap_angle(turns - motions.motion[:, 2])
     known = np.isfinite(error)
     seconds = motions.end_s - motions.begin_s
     design = np.column_stack([seconds, turns])[known]
