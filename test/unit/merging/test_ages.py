@@ -21,7 +21,7 @@ def record(sequence, values, T_map_submap, end_ns):
 
 
 def test_a_wall_is_as_young_as_the_last_submap_that_has_its_cell():
-    walls = OccupancyMap(GridSpec(1.0, 1, 5, SE2()), np.array([[100, 0, 100, 100, 100]], np.int8))
+    spec, cells = GridSpec(1.0, 1, 5, SE2()), np.array([(0, col) for col in (0, 2, 3, 4)])
     records = [
         record(2, [[100, -1, 100]], SE2(), 9),
         record(0, [[100, 100, 100]], SE2(), 5),
@@ -29,7 +29,7 @@ def test_a_wall_is_as_young_as_the_last_submap_that_has_its_cell():
         record(1, [[0], [0], [-1]], SE2(5.0, 0.0, math.pi / 2.0), 7),
         record(3, [[100] * 5], SE2(), 0),
     ]
-    # Cell 1 is water; the turned submap knows cells 3 and 4 only.
-    assert last_seen_ns(walls, records).tolist() == [[9, 0, 9, 7, 7]]
-    assert last_seen_ns(walls, records[1:]).tolist() == [[5, 0, 5, 7, 7]]
-    assert last_seen_ns(walls, records[3:]).tolist() == [[0] * 5]
+    # The turned submap knows cells 3 and 4 only.
+    assert last_seen_ns(spec, records, cells).tolist() == [9, 9, 7, 7]
+    assert last_seen_ns(spec, records[1:], cells).tolist() == [5, 5, 7, 7]
+    assert last_seen_ns(spec, records[3:], cells).tolist() == [0] * 4

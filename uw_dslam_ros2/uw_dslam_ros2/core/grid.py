@@ -41,7 +41,7 @@ UNITS_PER_NAT = 1000.0
 MAX_MAP_SIDE = 20_000
 """Rows and columns of the largest map that is made whole: to be shown, sent, written, matched."""
 
-_STRIP_ROWS = 256
+_STRIP_ROWS = 128
 
 UNSEEN = np.int16(-32768)
 """Instead of log-odds: nothing was observed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import tempfile
@@ -71,7 +72,8 @@ def _files(showing: Showing, group: int, records: list[SubmapRecord]) -> dict[st
         with tempfile.TemporaryDirectory() as folder:
             for path in write_map(Path(folder) / "map", occupancy):
                 files[path.name] = path.read_bytes()
-        walls, piers = trace_walls(occupancy, last_seen_ns(occupancy, records))
+        ages = functools.partial(last_seen_ns, occupancy.spec, records)
+        walls, piers = trace_walls(occupancy, ages)
         files["walls.geojson"] = walls_geojson_bytes(walls, piers)
         files["walls.dxf"] = dxf_bytes(walls, piers)
         frame, T_earth_map = "metres of the map", SE2()

@@ -177,7 +177,7 @@ def lay_on(target: OccupancyMap, source: OccupancyMap, T_target_source: SE2) -> 
     (row_0, row_1), (col_0, col_1) = (_span(known.any(axis=axis)) for axis in (1, 0))
     shown = slice(row_0, row_1), slice(col_0, col_1)
     spec = laid.part(row_0, col_0, row_1 - row_0, col_1 - col_0)
-    return Pair(spec, own[shown], other[shown])
+    return Pair(spec, own[shown].copy(), other[shown].copy())
 
 
 def _span(known: NDArray[np.bool_]) -> tuple[int, int]:

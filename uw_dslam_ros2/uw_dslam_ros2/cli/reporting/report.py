@@ -20,7 +20,7 @@ from uw_dslam_ros2.cli.reporting.wall_lines import walls_of, walls_picture
 from uw_dslam_ros2.core.merging import Georeference
 from uw_dslam_ros2.core.registration.result import Verdict
 from uw_dslam_ros2.io.atomic import write_files
-from uw_dslam_ros2.io.heap import give_back
+from uw_dslam_ros2.io.heap import give_back, trim
 from uw_dslam_ros2.io.maps.provenance import contradictions_png
 from uw_dslam_ros2.io.maps.walls import dxf_bytes, walls_geojson_bytes
 from uw_dslam_ros2.view.pairs import KEY
@@ -84,6 +84,7 @@ def write_report(
         }
     )
     if has_pictures:
+        trim()
         images = _draw(outcome, facts, truth, scores)
         if outcome.global_map is not None:
             figure = walls_picture(outcome.global_map, walls, piers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -31,7 +32,8 @@ def walls_of(outcome: Outcome) -> tuple[list[Wall], list[Pier]]:
     if outcome.global_map is None:
         return [], []
     merged = [record for record in outcome.records if record.state is SubmapState.MERGED]
-    return trace_walls(outcome.global_map, last_seen_ns(outcome.global_map, merged))
+    ages = functools.partial(last_seen_ns, outcome.global_map.spec, merged)
+    return trace_walls(outcome.global_map, ages)
 
 
 def walls_picture(occupancy: OccupancyMap, walls: Sequence[Wall], piers: Sequence[Pier]) -> Figure:

@@ -39,6 +39,7 @@ from uw_dslam_ros2.io.conventions import CorrectedMountings
 from uw_dslam_ros2.io.events import VehicleReader
 from uw_dslam_ros2.io.examining import mended
 from uw_dslam_ros2.io.feeding import feed_runs, in_stamp_order
+from uw_dslam_ros2.io.heap import trim
 from uw_dslam_ros2.io.mountings import role_of
 from uw_dslam_ros2.io.readings import DepthEvent, FixEvent
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
@@ -308,7 +309,9 @@ def settle(
     """
 
     def answer(request: MatchRequest) -> RegistrationResult:
-        return register_grids(request.source, request.target, config, prior=request.prior)
+        result = register_grids(request.source, request.target, config, prior=request.prior)
+        trim()  # or the next one, of maps of other sizes, finds no room in the holes
+        return result
 
     with ThreadPoolExecutor(num_processors()) as pool:
         while requests := queue.next_requests(_BATCH):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -19,6 +19,7 @@ __all__ = ["Pier", "Wall", "trace_walls"]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Ages = Callable[[IntArray], IntArray]
 
 _WALL_PERCENT = 50
 _AROUND_CELLS = 3
@@ -56,7 +57,7 @@ class Pier:
 
 def trace_walls(
     occupancy: OccupancyMap,
-    last_seen_ns: IntArray | None = None,
+    last_seen_ns: Ages | None = None,
     *,
     gap_m: float | None = None,
     pier_m: float = 1.0,
@@ -68,7 +69,7 @@ def trace_walls(
     occupancy
         The map; cells above 50 percent are walls.
     last_seen_ns
-        (R, C) int64: when each cell was last seen; 0 where that is not known.
+        Takes cells (N, 2) [row, col] to when each was last seen (N,); 0 where that is not known.
     gap_m
         Walls that end no farther from each other than that are one. Default: 0.3 m, which is what
         a beam of a degree leaves open at 17 m, or two cells.
@@ -78,18 +79,13 @@ def trace_walls(
     Raises
     ------
     InvalidInputError
-        A gap or size that is negative or not finite, ages of another shape than the map.
+        A gap or size that is negative or not finite.
     """
     spec = occupancy.spec
     gap_m = max(0.3, 2.0 * spec.resolution_m) if gap_m is None else gap_m
     for name, value in (("gap_m", gap_m), ("pier_m", pier_m)):
         if not (math.isfinite(value) and value >= 0.0):
             raise InvalidInputError(f"{name} is {value}, expected a number of at least 0")
-    if last_seen_ns is not None and last_seen_ns.shape != occupancy.values.shape:
-        raise InvalidInputError(
-            f"last_seen_ns has shape {last_seen_ns.shape}, expected the map's "
-            f"{occupancy.values.shape}"
-        )
     is_wall = occupancy.values > _WALL_PERCENT
     gap_cells = gap_m / spec.resolution_m
     piers, is_line = [], is_wall.copy()
@@ -97,7 +93,7 @@ def trace_walls(
         side_m = float((np.ptp(cells, axis=0).max() + 1) * spec.resolution_m)
         if side_m <= pier_m:
             ((x, y),) = spec.centers_of(cells.mean(axis=0)[None])
-            seen_ns = 0 if last_seen_ns is None else int(last_seen_ns[tuple(cells.T)].max())
+            seen_ns = 0 if last_seen_ns is None else int(last_seen_ns(cells).max())
             piers.append(Pier(float(x), float(y), side_m, seen_ns or None))
             is_line[tuple(cells.T)] = False
     runs = skeleton_runs(is_line, gap_cells)
@@ -105,7 +101,7 @@ def trace_walls(
 
 
 def _walls(
-    occupancy: OccupancyMap, is_line: BoolArray, runs: list[IntArray], ages: IntArray | None
+    occupancy: OccupancyMap, is_line: BoolArray, runs: list[IntArray], ages: Ages | None
 ) -> Iterator[Wall]:
     padded = np.pad(is_line, _AROUND_CELLS)
     areas, latest = _nearest(is_line, runs, ages)
@@ -150,7 +146,7 @@ def _across(run: IntArray, padded: BoolArray) -> FloatArray:
 
 
 def _nearest(
-    is_line: BoolArray, runs: list[IntArray], ages: IntArray | None
+    is_line: BoolArray, runs: list[IntArray], ages: Ages | None
 ) -> tuple[IntArray, IntArray]:
     """How many wall cells lie nearest to each run, and when the last of them was seen."""
     from scipy.spatial import cKDTree  # not every program that has charts draws lines
@@ -162,5 +158,5 @@ def _nearest(
     owner = np.repeat(np.arange(len(runs)), [len(run) for run in runs])
     nearest = owner[cKDTree(np.concatenate(runs)).query(cells)[1]]
     if ages is not None:
-        np.maximum.at(latest, nearest, ages[tuple(cells.T)])
+        np.maximum.at(latest, nearest, ages(cells))
     return np.bincount(nearest, minlength=len(runs)), latest

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.grid import OccupancyMap
 
-__all__ = ["FilteredCells", "clean_cells", "coarsen", "split"]
+__all__ = ["FilteredCells", "clean_cells", "clean_masks", "coarsen", "split"]
 
 FloatGrid = NDArray[np.float32]
+Shares = NDArray[Any]  # float32; or uint8 where each is 0 or 1
 
 # The paper's maps and map_server agree on decided cells; between the two lies "contradicting
 # echoes".
@@ -35,8 +37,8 @@ class FilteredCells:
 
     resolution_m: float
     wall: FloatGrid
-    free: FloatGrid
-    known: FloatGrid
+    free: Shares
+    known: Shares
     row: FloatGrid
     col: FloatGrid
 
@@ -101,7 +103,12 @@ def _surface(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def clean_cells(occupancy: OccupancyMap) -> FilteredCells:
-    """Drop specks from a map (R, C).
+    """Drop specks from a map (R, C); see `clean_masks`."""
+    return _with_shares(clean_masks(occupancy))
+
+
+def clean_masks(occupancy: OccupancyMap) -> FilteredCells:
+    """The same to be made larger: ``free`` and ``known`` are uint8, for a quarter of the room.
 
     A wall cell stays where a line of nine cells through it holds a line's worth of walls; free and
     unknown are decided by the majority of a neighbourhood. Algorithm 2's clustering filter, on
@@ -124,11 +131,17 @@ def clean_cells(occupancy: OccupancyMap) -> FilteredCells:
     return FilteredCells(
         occupancy.spec.resolution_m,
         evidence,
-        free.astype(np.float32),
-        (known | body).astype(np.float32),
+        free.view(np.uint8),
+        (known | body).view(np.uint8),
         np.broadcast_to(rows[:, None], values.shape),
         np.broadcast_to(cols, values.shape),
     )
+
+
+def _with_shares(cells: FilteredCells) -> FilteredCells:
+    if cells.free.dtype == np.float32:
+        return cells
+    return replace(cells, free=cells.free.astype(np.float32), known=cells.known.astype(np.float32))
 
 
 def _is_majority(mask: NDArray[np.bool_], border: int) -> NDArray[np.bool_]:
@@ -148,14 +161,15 @@ def coarsen(cells: FilteredCells, resolution_m: float) -> FilteredCells:
     """
     ratio = resolution_m / cells.resolution_m
     if ratio < 1.0 + 1e-9:
-        return cells
+        return _with_shares(cells)
     whole = round(ratio)
     arrays = (cells.wall, cells.free, cells.known, cells.row, cells.col)
     if abs(ratio - whole) < 1e-9 * ratio:
         sums = _whole_block_sums(*arrays, whole)  # much quicker
     else:
         starts = [_block_starts(size, ratio) for size in cells.shape]
-        wall, free, known, row, col = arrays
+        cells = _with_shares(cells)
+        wall, free, known, row, col = cells.wall, cells.free, cells.known, cells.row, cells.col
         counted = (wall, free, known, wall * row, wall * col, np.ones(cells.shape, np.float32))
         sums = np.stack([_block_sum(values, starts) for values in counted])
     wall_sum, free_sum, known_sum, row_sum, col_sum, count = sums
@@ -195,8 +209,9 @@ def _block_starts(size: int, ratio: float) -> NDArray[np.int64]:
 
 @njit(cache=True, nogil=True)
 def _whole_block_sums(
-    wall: FloatGrid, free: FloatGrid, known: FloatGrid, row: FloatGrid, col: FloatGrid, side: int
-) -> FloatGrid:
+    wall: FloatGrid, free: Shares, known: Shares,
+    row: FloatGrid, col: FloatGrid, side: int,
+) -> FloatGrid:  # fmt: skip
     """Sums (6, R, C) over blocks of ``side`` x ``side`` cells.
 
     Of the first three arrays, of the walls' rows and columns, and of ones.

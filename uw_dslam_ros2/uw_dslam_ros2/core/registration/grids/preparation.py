@@ -9,7 +9,7 @@ import numpy as np
 
 from uw_dslam_ros2.core.features.grid_filter import (
     FilteredCells,
-    clean_cells,
+    clean_masks,
     coarsen,
     split,
 )
@@ -59,11 +59,12 @@ def prepare_maps(
     resolution_m = _finest_resolution(source, target, config.finest_cells)
     sides = []
     for name, occupancy in zip(names, (source, target), strict=True):
-        cells = clean_cells(occupancy)
+        cells = clean_masks(occupancy)
         if (fault := _too_little(name, occupancy, cells, config.min_wall_cells)) is not None:
             return fault
-        sides.append(coarsen(cells, resolution_m))
-    finest = (WallMap(sides[0]), WallMap(sides[1]))
+        sides.append(WallMap(coarsen(cells, resolution_m)))
+        del cells  # far larger than what is left of a large map
+    finest = (sides[0], sides[1])
     return make_levels(*finest, config), _scales(finest)
 
 
