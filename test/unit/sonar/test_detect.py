@@ -269,3 +269,20 @@ def test_beams_without_an_echo_above_a_drivers_threshold_are_not_dead(rng):
     intensity[intensity < 16] = 0  # sparse specks are left
     intensity[:, 50:] = 0
     assert not silent_beams(intensity).any()
+
+
+@pytest.mark.parametrize("least", [60, 200])
+def test_what_a_drivers_threshold_left_are_echoes(rng, least):
+    intensity = noisy(rng)
+    cut = np.where(intensity >= least, intensity, 0).astype(np.uint8)
+    binary = np.where(intensity >= least, 255, 0).astype(np.uint8)
+    expected = detect(image(intensity))
+    for pixels in (cut, binary):
+        found = detect(image(pixels))
+        np.testing.assert_allclose(found.points, expected.points, atol=0.05)
+
+
+def test_few_counts_above_nothing_are_no_echoes(rng):
+    counts = rng.poisson(0.01, (200, 64)).astype(np.uint8)  # of a gain that is too low
+    counts[100, 30] = 60
+    assert len(detect(image(counts)).points) == 0

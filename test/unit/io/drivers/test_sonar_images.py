@@ -10,6 +10,7 @@ from unit.io.drivers.messages import STAMP_NS, header, image_data, target_at, ve
 
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.io.drivers import ReadSettings, adapter_of
+from uw_dslam_ros2.io.drivers.pixels import without_pedestal
 
 SETTINGS = ReadSettings(vehicle_id="auv_1")
 PORT, STARBOARD = np.radians(30.0), np.radians(-30.0)
@@ -352,6 +353,21 @@ def test_an_image_that_cannot_tell_is_left_alone(rng, scale):
     (event,) = read("sensor_msgs/msg/Image", fan(pixels, "mono16"), settings)
     np.testing.assert_array_equal(event.image.intensity, pixels)
     assert "is_swapped" not in settings.memory
+
+
+@pytest.mark.parametrize("dtype", ["u2", "u4", "f4"])
+def test_pixels_that_never_come_near_zero_stand_on_a_pedestal(rng, dtype):
+    # The first rows are blanked by the driver, and stay so.
+    amplitude = np.zeros((120, 80))
+    amplitude[10:] = 1.0 + np.round(rng.rayleigh(100.0, (110, 80)))
+    amplitude[60, 20:60] = 2000.0
+    stands = np.where(amplitude > 0.0, amplitude + 3000.0, 0.0).astype(dtype)
+    least = amplitude[amplitude > 0.0].min()
+    found = without_pedestal(stands)
+    assert found.dtype == stands.dtype
+    np.testing.assert_array_equal(found, np.where(amplitude > 0.0, amplitude - least, 0.0))
+    plain = amplitude.astype(dtype)
+    assert without_pedestal(plain) is plain
 
 
 def wall_in_speckle(rng, num_ranges, num_beams):

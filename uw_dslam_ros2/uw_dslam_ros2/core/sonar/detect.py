@@ -46,6 +46,10 @@ reflector may have been missed.
 _WIDE_FAN_RAD, _RING_SHARE = (1.5, 4.0), 0.6
 """Of so wide a fan no wall fills so many beams at one range: that is the sea bed's or the
 surface's first echo, or another sonar's ping. A turn may be of a round basin."""
+_MAX_CUT_SHARE, _MIN_CUT_LEVEL = 0.03, 0.02
+"""Of an image that its driver cut off at a threshold few pixels are left, none of which is dark:
+in power a fiftieth of the brightest."""
+_CUT_RATIO = 4.0
 _POINT_SPACING_RAD = 0.02
 _MIN_TURN_POINTS, _MAX_TURN_GAP_RAD, _TURN_SPACING_RAD = 30, 0.5 * np.pi, (0.01, 0.1)
 
@@ -190,6 +194,8 @@ def image_echoes(image: SonarImage, config: SonarConfig) -> BeamEchoes:
     if not np.isfinite(power[:, :].sum(dtype=np.float64)):
         raise InvalidInputError("intensity holds values that are not finite")
     ratio = _threshold_ratio(power, _full_scale(intensity.dtype), config)
+    if _is_cut_off(power):
+        ratio[power > 0.0] = np.maximum(ratio[power > 0.0], _CUT_RATIO)
     if _WIDE_FAN_RAD[0] < np.ptp(bearing_rad) < _WIDE_FAN_RAD[1]:
         ratio[(ratio > 1.0).mean(axis=1) > _RING_SHARE] = 0.0
     gap_bins = config.min_separation_m / bin_m if bin_m > 0.0 else 1.0
@@ -210,6 +216,17 @@ def image_echoes(image: SonarImage, config: SonarConfig) -> BeamEchoes:
         np.maximum(free_range_m, 0.0),
         range_sigma_m,
     )
+
+
+def _is_cut_off(power: NDArray[np.float32]) -> bool:
+    """Whether a driver's threshold left nothing but echoes, so that no noise is there to judge by.
+
+    Power is (R, B).
+    """
+    num_left = int(np.count_nonzero(power))
+    if not 0 < num_left <= _MAX_CUT_SHARE * power.size:
+        return False
+    return bool(power[power > 0.0].min() >= _MIN_CUT_LEVEL * power.max())
 
 
 def scan_echoes(

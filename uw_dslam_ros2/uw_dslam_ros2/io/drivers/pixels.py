@@ -12,7 +12,7 @@ from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io.drivers.adapter import as_bytes
 from uw_dslam_ros2.io.drivers.settings import ReadSettings
 
-__all__ = ["amplitudes", "decoded", "image_pixels", "pixels_of"]
+__all__ = ["amplitudes", "decoded", "image_pixels", "pixels_of", "without_pedestal"]
 
 Pixels = NDArray[np.generic]
 
@@ -24,6 +24,9 @@ _ROUGH = 0.15
 _SMOOTH = 0.4
 _MIN_VALUES = 8
 _FLOOR_DB = -200.0
+_PEDESTAL = 0.5
+"""Share of their median from which on the least of the pixels is no noise, but an offset."""
+_MOST_EMPTY = 0.5  # of an image that stands on one: a sector may be blanked
 
 
 def pixels_of(data: Any, dtype: np.dtype[Any], shape: tuple[int, int], field: str) -> Pixels:
@@ -39,11 +42,12 @@ def pixels_of(data: Any, dtype: np.dtype[Any], shape: tuple[int, int], field: st
 
 
 def amplitudes(pixels: Pixels, settings: ReadSettings) -> Pixels:
-    """Repair what is certainly not meant as it stands: swapped bytes, decibels.
+    """Repair what is certainly not meant as it stands: swapped bytes, decibels, a pedestal.
 
     16 bits of a real echo have a smooth high byte and a rough low one; the other way round, or
     with a high byte that never changes and is not 0, the message's byte order is wrong. Reals
     that are negative are decibels, as the simulator DAVE has them: an amplitude has no sign.
+    Silence is 0: where no pixel comes near it, an offset was added, which hides the contrast.
     """
     if pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
         if "is_swapped" not in settings.memory:
@@ -59,7 +63,7 @@ def amplitudes(pixels: Pixels, settings: ReadSettings) -> Pixels:
                     "(is_bigendian); they were swapped: mend the driver",
                 )
             )
-            return pixels.byteswap()
+            return without_pedestal(pixels.byteswap())
     if pixels.dtype.kind == "f":
         values = pixels.astype(np.float64)
         if "is_db" not in settings.memory and (np.isfinite(values) & (values != 0.0)).any():
@@ -72,8 +76,20 @@ def amplitudes(pixels: Pixels, settings: ReadSettings) -> Pixels:
             settings.memory["peak"] = peak
             return np.asarray(amplitude / peak, np.float32)
         if np.isnan(values).any():
-            return np.where(np.isnan(values), 0.0, pixels)  # nothing was measured there
-    return pixels
+            pixels = np.where(np.isnan(values), 0.0, pixels)  # nothing was measured there
+    return without_pedestal(pixels)
+
+
+def without_pedestal(pixels: Pixels) -> Pixels:
+    """Pixels less the least of them, where that is far from 0; pixels of 0 were blanked."""
+    is_said = pixels > 0  # type: ignore[operator]  # numbers
+    if is_said.mean() <= _MOST_EMPTY:
+        return pixels
+    said = pixels[is_said]
+    floor = said.min()
+    if float(floor) <= _PEDESTAL * float(np.median(said)) or floor == said.max():
+        return pixels
+    return np.where(is_said, pixels - floor, pixels).astype(pixels.dtype)
 
 
 def _is_swapped(pixels: Pixels) -> bool | None:
