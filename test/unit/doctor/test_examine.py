@@ -125,6 +125,13 @@ def test_the_cause_is_named_and_mended(recording, kind):
         assert changes[name] == pytest.approx(value, abs=tolerance)
 
 
+def test_echoes_in_feet_move_farther_than_any_vehicle_and_are_understood(recording):
+    navigation, pings = sonar(lambda p: p / 0.3048)(*recording)
+    found = examine(*imu(lambda _, yaw, rate: (0.5 * math.pi - yaw, -rate))(navigation, pings))
+    assert [finding.kind for finding in found.findings] == ["imu_ned", "sonar_range_factor"]
+    assert found.conventions.sonar_range_scale == pytest.approx(0.3048, abs=0.01)
+
+
 def test_nothing_is_said_where_nothing_is_wrong(recording):
     found = examine(*recording)
     assert found.findings == []
@@ -280,6 +287,19 @@ def test_a_steady_drift_is_mended_where_heading_and_rates_have_it(recording, rat
     # Beside a heading that holds, rates with a bias are the filter's task.
     held = imu(lambda _, yaw, r: (yaw, r + rate))(*recording)
     assert examine(*held).findings == []
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "sign"),
+    [
+        (sonar(lambda p: p * [1.0, -1.0]), 1.0),
+        (imu(lambda _, yaw, rate: (0.5 * math.pi - yaw, -rate)), -1.0),
+    ],
+)
+def test_a_drift_is_mended_as_the_heading_is_read(recording, corrupt, sign):
+    drifts = imu(lambda t, yaw, rate: (yaw + 0.004 * t, rate + 0.004))
+    found = examine(*drifts(*corrupt(*recording)))
+    assert found.conventions.imu_drift_rad_s == pytest.approx(sign * 0.004, abs=6e-4)
 
 
 def test_a_drift_that_comes_and_goes_is_told_and_not_mended(recording):

@@ -23,8 +23,8 @@ def test_a_factor_that_is_a_unit_is_the_dvls(unit, error):
 
 
 @pytest.mark.parametrize("error", [0.98, 1.0])
-@pytest.mark.parametrize("factor", [0.5, 2.0, 1.0 / 0.3048])
-def test_ranges_there_and_back_half_of_them_or_in_feet_are_the_sonars(factor, error):
+@pytest.mark.parametrize("factor", [0.5, 2.0, 1.0 / 0.3048, 0.1, 10.0])
+def test_ranges_in_another_unit_or_there_and_back_are_the_sonars(factor, error):
     kinds, changes = judged(factor * error)
     assert kinds == ["sonar_range_factor"]
     assert changes == {"sonar_range_scale": pytest.approx(1.0 / factor, rel=1e-3)}

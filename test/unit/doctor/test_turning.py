@@ -174,3 +174,10 @@ def test_nearness_is_that_of_all_pairs_of_one_stretch_that_are_apart(rng):
     assert count == len(near)
     assert mean == pytest.approx(np.mean(near))
     assert mean_nearness(stamp_s, stretch, x, y, 30.0, 0.7, 1) == (0.0, 0)
+
+
+def test_a_delay_beyond_those_that_are_tried_is_told_and_not_mended():
+    found = examined(*recording(2, delay_s=4.0))
+    (finding,) = (f for f in found.findings if f.kind == "imu_delay")
+    assert "2 s or more" in finding.detail
+    assert found.conventions.imu_delay_s == 0.0

@@ -6,6 +6,7 @@ DVL says, if all are read rightly. Of two readings that fit equally well neither
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 
@@ -39,7 +40,11 @@ from uw_dslam_ros2.core.doctor.motions.fits import (
     fit_turns,
     fit_velocity,
 )
-from uw_dslam_ros2.core.doctor.motions.ping_motion import PingMotions, ping_motions
+from uw_dslam_ros2.core.doctor.motions.ping_motion import (
+    PingMotions,
+    far_ping_motions,
+    ping_motions,
+)
 from uw_dslam_ros2.core.doctor.motions.turn_errors import fit_turn_errors
 from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample, PingSample
 
@@ -52,6 +57,7 @@ _MIN_MOTIONS = 15
 _MIN_READINGS = 20
 _UNIT_LOG = math.log(1.3)
 _MAX_WAY_COST = 1.5  # of a velocity that explains how the echoes move
+_FEET = 0.3048
 
 
 def examine(
@@ -83,6 +89,15 @@ def examine(
     navigation = without_spikes(without_zeros(result, navigation))
     if len(motions) >= _MIN_MOTIONS:
         _Trial(result, navigation, imu, motions, pings).run()
+        return result
+    # Echoes in feet go farther from ping to ping than a vehicle does.
+    far = far_ping_motions(pings, 0.7, 2.1, _FEET)
+    if len(far) >= _MIN_MOTIONS:
+        by_far = copy.deepcopy(result)
+        _Trial(by_far, navigation, imu, far, pings).run()
+        if "sonar_range_factor" in by_far.mended:
+            by_far.num_ping_motions = len(far)
+            return by_far
     return result
 
 
@@ -144,15 +159,15 @@ class _Trial:
             side = rates[0].sign * orientation[0].sign
             apart = by_rates - side * imu.by_orientation
             apart_rad_s = float((apart[-1] - apart[0]) / (imu_s[-1] - imu_s[0]))
-        judge_drift(
-            self._result, self._motions, imu_s, self._yaw, fits[0], errors, apart_rad_s,
-            self._start_s,
-        )  # fmt: skip
         reading: _Reading | None = _Reading(fits[0].sign)
         if rates and orientation and rates[0].sign != orientation[0].sign:
             say_one_flipped(self._result, rates[0].sign, orientation[0].sign, orientation)
         elif fits[0].sign < 0:
             reading = self._handedness()
+        judge_drift(
+            self._result, self._motions, imu_s, self._yaw, fits[0], errors, apart_rad_s,
+            self._start_s, 0 if reading is None else reading.yaw_sign,
+        )  # fmt: skip
         if reading is None:
             say_delays(self._result, find_delays(fits, lambda _: None, SURE, _LIKELY))
             return

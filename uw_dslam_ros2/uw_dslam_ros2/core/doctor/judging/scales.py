@@ -19,8 +19,9 @@ _UNITS = {
     "millimetres per second": 1e-3, "centimetres per second": 1e-2, "knots": 0.5144,
     "kilometres per hour": 1.0 / 3.6, "feet per second": 0.3048,
 }  # fmt: skip
-_RANGE_FACTORS = (0.5, 2.0, 1.0 / 0.3048)
-"""Of ranges there and back, or half of them; in feet."""
+_RANGE_FACTORS = (0.5, 2.0, 1.0 / 0.3048, 0.1, 10.0)
+"""Of ranges there and back, or half of them; in feet; centimetres for millimetres, or decimetres.
+"""
 _MAX_RANGE_FACTOR = 5.0
 
 
@@ -103,7 +104,7 @@ def _say_unit(result: Examination, scale: float) -> None:
     is_unit = _distance(scale, unit) < _UNIT_TOLERANCE
     is_plain = _distance(scale, plain) < _UNIT_TOLERANCE
     # A DVL measures in some unit; the length of a sonar's range bins is often set by hand.
-    is_dvl = is_unit or not 1.0 / _MAX_RANGE_FACTOR < scale < _MAX_RANGE_FACTOR
+    is_dvl = is_unit or not (is_plain or 1.0 / _MAX_RANGE_FACTOR < scale < _MAX_RANGE_FACTOR)
     if is_dvl or (not is_plain and _distance(scale, unit) < 3.0 * _UNIT_TOLERANCE):
         factor = unit if is_unit else scale
         said = f": it is in {name}" if is_unit else ", which is no unit"

@@ -43,6 +43,7 @@ def judge_drift(
     errors: TurnErrors,
     apart_rad_s: float,
     start_s: float,
+    yaw_sign: int = 1,
 ) -> None:
     """Tell of a heading that drifts; mend it where it does so steadily.
 
@@ -51,6 +52,7 @@ def judge_drift(
     yaw_rad : (K,) at ``imu_s`` (K,), not wrapped, that turns as `fit` and `errors` say.
     apart_rad_s : by how much faster than the orientation it drifts.
     start_s : stamp that the times are counted from.
+    yaw_sign : -1 where the yaw will be read the other way round, 0 where that is not known.
     """
     bias, sigma = errors.bias_rad_s, errors.bias_sigma_rad_s
     if abs(bias) < max(_MIN_DRIFT_RAD_S, 5.0 * sigma):
@@ -60,10 +62,10 @@ def judge_drift(
         return  # beside an orientation that holds, the mapper's filter finds the bias
     changes: dict[str, float] = {}
     mend = "let it settle before the dive, or calibrate it"
-    is_plain = fit.sign > 0 and abs(drift) < _MAX_DRIFT_RAD_S
+    is_plain = yaw_sign != 0 and abs(drift) < _MAX_DRIFT_RAD_S
     if is_plain and _is_steady(motions, imu_s, yaw_rad, fit, bias):
         changes = {
-            "imu_drift_rad_s": float(f"{drift:.3g}"),
+            "imu_drift_rad_s": float(f"{yaw_sign * drift:.3g}"),
             "imu_drift_since_s": round(start_s, 2),
         }
         mend += f" ({words_of(changes)})"

@@ -16,13 +16,17 @@ __all__ = ["judge_offset", "say_in_world", "say_mirrored"]
 FloatArray = NDArray[np.float64]
 
 _MIN_OFFSET_RAD = math.radians(2.5)
+_MIN_COARSE_OFFSET_RAD = math.radians(15.0)
+"""Where the echoes' motions are far too short, they are only as good as that."""
+_COARSE_SCALE = 0.2
 
 
 def judge_offset(result: Examination, fit: VelocityFit, velocity_m_s: FloatArray) -> None:
     """Tell of a DVL or a sonar that is turned; ``velocity_m_s`` (V, 2) is the DVL's."""
     sigma = fit.factor_sigma / max(fit.scale, 1e-9)
     offset = fit.yaw_rad
-    if abs(offset) < max(_MIN_OFFSET_RAD, 4.0 * sigma) or sigma > 0.2:
+    least = _MIN_COARSE_OFFSET_RAD if fit.scale < _COARSE_SCALE else _MIN_OFFSET_RAD
+    if abs(offset) < max(least, 4.0 * sigma) or sigma > 0.2:
         return
     degrees = math.degrees(offset)
     mean = complex(*np.median(velocity_m_s, axis=0))

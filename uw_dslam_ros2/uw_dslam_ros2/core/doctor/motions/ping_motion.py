@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from uw_dslam_ros2.core.doctor.samples.sample import PingSample
 from uw_dslam_ros2.core.mapping.scans.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["PingMotions", "have_echoes", "ping_motions"]
+__all__ = ["PingMotions", "far_ping_motions", "have_echoes", "ping_motions"]
 
 FloatArray = NDArray[np.float64]
 
@@ -94,6 +94,20 @@ def ping_motions(pings: PingSample, min_gap_s: float, max_gap_s: float) -> PingM
         np.array([row[1] for row in rows]),
         np.array([row[2] for row in rows]).reshape(-1, 3),
         np.array([row[3] for row in rows]).reshape(-1, 3, 3),
+    )
+
+
+def far_ping_motions(
+    pings: PingSample, min_gap_s: float, max_gap_s: float, scale: float
+) -> PingMotions:
+    """The same where ranges are far too long, found by ranges `scale` times as long."""
+    points = tuple(scale * own for own in pings.points)
+    found = ping_motions(replace(pings, points=points), min_gap_s, max_gap_s)
+    shrink = np.array([scale, scale, 1.0])
+    return replace(
+        found,
+        motion=found.motion / shrink,
+        information=found.information * shrink[:, None] * shrink,
     )
 
 

@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 _SHARED = 1.5
 """Windows overlap by half, so that so many of them count as one."""
 _MIN_OFFSET_RAD, _SIGMAS = math.radians(4.0), 4.0
-_MIN_DELAY_S = 0.15
+_MIN_DELAY_S, _END_OF_SEARCH_S = 0.15, 1.95
 
 
 def examine_turning(
@@ -193,6 +193,17 @@ class _Judge:
         still = self._trial.score(replace(best.reading, delay_s=known_s))
         sure = confidence_of(best, still)
         if abs(delay_s - known_s) < _MIN_DELAY_S or sure < SURE:
+            return
+        if abs(delay_s) > _END_OF_SEARCH_S:
+            self._result.tell(
+                "imu_delay",
+                "imu",
+                f"its stamps are {'later' if delay_s > 0.0 else 'earlier'} than the sonar's by "
+                f"{abs(delay_s):.0f} s or more: where a message holds a turn, its stamp may be "
+                "that of the last beam (scan_stamp: last), or its beams' times are not told "
+                "(scan_period_s)",
+                sure,
+            )
             return
         self._result.tell(
             "imu_delay",
