@@ -95,6 +95,25 @@ def test_rays_of_a_slow_scan_have_their_own_time():
     assert event.intensity is None
 
 
+@pytest.mark.parametrize("seconds", [14, 1])
+def test_a_turn_without_times_takes_as_long_as_it_is_to_the_next(seconds):
+    told = []
+    settings = replace(SETTINGS, tell=told.append, memory={})
+    found = []
+    for number in range(3):
+        turn = scan(np.full(8, 4.0), angle_increment=np.pi / 4)
+        turn.header.stamp.sec += seconds * number
+        found.append(read(LASER, turn, settings))
+    assert found[0] == ()  # of the first nobody knows yet
+    for number in (1, 2):
+        (event,) = found[number]
+        assert isinstance(event, BeamsEvent if seconds == 14 else ScanEvent)
+        assert event.stamp_ns == STAMP_NS + seconds * number * SECOND
+        if seconds == 14:
+            np.testing.assert_allclose(np.diff(event.beam_stamp_ns) / SECOND, 14.0 / 8.0)
+    assert [finding.kind for finding in told] == ["scan_times"] * (seconds == 14)
+
+
 def test_a_turn_is_spread_over_its_scan_time():
     ranges = np.arange(1.0, 9.0)
     turn = scan(ranges, angle_increment=np.pi / 4, scan_time=16.0)

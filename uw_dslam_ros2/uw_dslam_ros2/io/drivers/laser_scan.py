@@ -21,6 +21,8 @@ FloatArray = NDArray[np.float64]
 ONE_MOMENT_S = 0.1
 """What takes less is taken for one moment: a vehicle moves centimetres meanwhile."""
 _MIN_PROFILE = 8
+_LONG_TURN_S = 3.0
+"""Whole turns that come as seldom are of a sonar that turns; a ring of beams pings more often."""
 
 
 def read_scan(msg: Any, settings: ReadSettings) -> Sequence[ScanEvent | BeamsEvent]:
@@ -46,7 +48,8 @@ def read_scan(msg: Any, settings: ReadSettings) -> Sequence[ScanEvent | BeamsEve
     if range_max_m == 0.0:
         return ()
     angles = values[0] + values[1] * np.arange(len(ranges), dtype=np.float64)
-    offset_s = _offsets(msg, settings, len(ranges))
+    if (offset_s := _offsets(msg, settings, len(ranges))) is None:
+        return ()
     if len(ranges) > 1 and abs(offset_s[-1] - offset_s[0]) < ONE_MOMENT_S:
         return (ScanEvent(*key_of(msg, settings), angles, ranges, range_max_m),)
     stamps = stamp_of(msg) + np.round(offset_s * 1e9).astype(np.int64)
@@ -82,8 +85,8 @@ def _farthest(ranges: FloatArray, settings: ReadSettings) -> float:
     return found
 
 
-def _offsets(msg: Any, settings: ReadSettings, num_rays: int) -> FloatArray:
-    """Time of each ray after the stamp [s]."""
+def _offsets(msg: Any, settings: ReadSettings, num_rays: int) -> FloatArray | None:
+    """Time of each ray after the stamp [s]; None where only the next turn will show it."""
     increment_s, period_s = float(msg.time_increment), float(msg.scan_time)
     if not np.isfinite((increment_s, period_s)).all():
         raise InvalidInputError(
@@ -94,9 +97,38 @@ def _offsets(msg: Any, settings: ReadSettings, num_rays: int) -> FloatArray:
     elif increment_s == 0.0 and _is_turn(msg, num_rays):
         # A fan of one moment also has a scan_time, the time to the next one: only a turn is
         # spread over it.
+        if period_s == 0.0:
+            if (period_s := _time_between(msg, settings)) < 0.0:
+                return None
+            period_s = period_s if period_s > _LONG_TURN_S else 0.0
         increment_s = period_s / num_rays
     offsets = increment_s * np.arange(num_rays, dtype=np.float64)
     return offsets - offsets[-1] if settings.scan_stamp == "last" else offsets
+
+
+def _time_between(msg: Any, settings: ReadSettings) -> float:
+    """The least time [s] from one message of this topic to the next so far; -1: not known yet."""
+    stamp_ns = stamp_of(msg)
+    last_ns = settings.memory.get("turn_ns")
+    settings.memory["turn_ns"] = stamp_ns
+    if last_ns is None:
+        return -1.0
+    least_s = float(settings.memory.get("turn_s", np.inf))
+    if stamp_ns > last_ns:
+        least_s = settings.memory["turn_s"] = min(least_s, (stamp_ns - last_ns) * 1e-9)
+    if not np.isfinite(least_s):
+        return 0.0  # of a clock that stands still
+    if least_s > _LONG_TURN_S:
+        settings.tell_once(
+            Finding(
+                "scan_times",
+                "sonar",
+                "its turns do not say when each beam was heard (time_increment and scan_time are "
+                f"0): the time from one to the next, {least_s:.1f} s, is taken for that of a turn "
+                "(scan_period_s)",
+            )
+        )
+    return least_s
 
 
 def _is_turn(msg: Any, num_rays: int) -> bool:
