@@ -158,6 +158,28 @@ def test_a_velocity_along_the_worlds_axes_is_turned_back(recording, is_ned):
     assert changes == ({"velocity_is_mirrored": True} if is_ned else {})
 
 
+def test_an_imu_and_a_velocity_in_north_and_east_are_both_told(recording):
+    navigation, pings = recording
+    yaw = np.interp(navigation.velocity_s, navigation.imu_s, navigation.yaw_rad)
+    in_world = np.array([turned(v, a) for v, a in zip(navigation.velocity_m_s, yaw, strict=True)])
+    navigation = replace(
+        navigation,
+        yaw_rad=0.5 * math.pi - navigation.yaw_rad,
+        yaw_rate_rad_s=-navigation.yaw_rate_rad_s,
+        velocity_m_s=in_world[:, ::-1],
+    )
+    found = examine(navigation, pings)
+    assert [f.kind for f in found.findings] == ["imu_ned", "dvl_in_world"]
+    changes = found.conventions.changes()
+    assert changes.pop("velocity_yaw_offset_rad") == pytest.approx(0.5 * math.pi, abs=0.05)
+    assert changes == {
+        "imu_orientation": "ned",
+        "imu_rates": "frd",
+        "velocity_axes": "world",
+        "velocity_is_mirrored": True,
+    }
+
+
 def test_without_an_orientation_a_velocity_along_the_worlds_axes_is_only_told(recording):
     navigation, pings = recording
     yaw = np.interp(navigation.velocity_s, navigation.imu_s, navigation.yaw_rad)

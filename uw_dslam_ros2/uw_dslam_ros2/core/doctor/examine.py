@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -172,7 +173,8 @@ class _Trial:
             say_delays(self._result, find_delays(fits, lambda _: None, SURE, _LIKELY))
             return
         if reading == _Reading():
-            reading = self._velocity_in_world() or self._velocity_side(reading)
+            plain = [self._fit(reading)]
+            reading = self._velocity_in_world(reading, plain) or self._velocity_side(reading)
         chosen = reading
         delays = find_delays(fits, lambda late_s: self._fit(chosen, late_s), SURE, _LIKELY)
         fit = self._fit(chosen, delays.velocity_after_imu_s)
@@ -213,10 +215,13 @@ class _Trial:
         if reading.is_velocity_in_world and self._imu.by_orientation is not None:
             yaw = self._imu.by_orientation  # it is this that turns the velocity back
         assert yaw is not None
+        yaw = reading.yaw_sign * yaw
+        if reading.is_velocity_in_world and reading.yaw_sign < 0:
+            yaw = yaw + 0.5 * math.pi  # a heading is counted from north
         return fit_velocity(
             self._motions if motions is None else motions,
             self._navigation,
-            reading.yaw_sign * yaw,
+            yaw,
             self._delay_s,
             sonar=complex(self._mount.x, self._mount.y),
             sonar_yaw_rad=self._mount.yaw,
@@ -230,6 +235,14 @@ class _Trial:
         """Say who is the wrong way round where the echoes turn against the IMU."""
         readings = _Reading(1, is_sonar_mirrored=True), _Reading(-1)
         sonar, imu = (self._fit(reading) for reading in readings)
+        if (world := self._velocity_in_world(readings[1], [sonar, imu])) is not None:
+            self._say_ned(
+                "it turns against the sonar's echoes, and the dvl's velocity, along the world's "
+                "axes, fits north, east, down (a mirrored sonar would make the mirror image of "
+                "the same map)",
+                self._side_confidence,
+            )
+            return world
         sure = 0.5
         if sonar is not None and imu is not None:
             sure = confidence_of(sonar, imu)
@@ -245,19 +258,10 @@ class _Trial:
             )
             return readings[0]
         if imu is not None and sure < 1.0 - SURE:
-            changes = {"imu_orientation": "ned", "imu_rates": "frd"}
-            if self._imu.by_orientation is None:
-                del changes["imu_orientation"]
-            if self._imu.by_rates is None:
-                del changes["imu_rates"]
-            self._result.tell(
-                "imu_ned",
-                "imu",
+            self._say_ned(
                 "it turns against the sonar's echoes, which move as the dvl says: its axes are "
-                "forward, right, down in north, east, down (conventions.imu_orientation: ned, "
-                "conventions.imu_rates: frd)",
+                "forward, right, down in north, east, down",
                 1.0 - sure,
-                **changes,
             )
             return readings[1]
         self._result.tell(
@@ -270,6 +274,15 @@ class _Trial:
         )
         return None
 
+    def _say_ned(self, detail: str, confidence: float) -> None:
+        changes = {"imu_orientation": "ned", "imu_rates": "frd"}
+        if self._imu.by_orientation is None:
+            del changes["imu_orientation"]
+        if self._imu.by_rates is None:
+            del changes["imu_rates"]
+        mend = "(conventions.imu_orientation: ned, conventions.imu_rates: frd)"
+        self._result.tell("imu_ned", "imu", f"{detail} {mend}", confidence, **changes)
+
     def _velocity_side(self, reading: _Reading) -> _Reading:
         """The reading, with the velocity's sideways axis the other way where that fits better."""
         other = replace(reading, is_velocity_mirrored=True)
@@ -279,18 +292,27 @@ class _Trial:
         self._side_confidence = confidence_of(mirrored, plain)
         return other if self._side_confidence > SURE else reading
 
-    def _velocity_in_world(self) -> _Reading | None:
-        """The reading along axes that do not turn with the vehicle, where only that fits."""
-        plain = self._fit(_Reading())
+    def _velocity_in_world(
+        self, reading: _Reading, others: Sequence[VelocityFit | None]
+    ) -> _Reading | None:
+        """The reading along axes that do not turn with the vehicle, where only that fits.
+
+        `others` are fits along the vehicle's own axes.
+        """
+        known = [fit for fit in others if fit is not None]
         readings = [
-            _Reading(is_velocity_mirrored=side, is_velocity_in_world=True)
+            replace(reading, is_velocity_mirrored=side, is_velocity_in_world=True)
             for side in (False, True)
         ]
-        fits = [(reading, fit) for reading in readings if (fit := self._fit(reading)) is not None]
-        if plain is None or not fits:
+        fits = [(own, fit) for own in readings if (fit := self._fit(own)) is not None]
+        if not known or not fits:
             return None
-        reading, world = min(fits, key=lambda item: float(np.nansum(item[1].cost)))
+        plain = min(known, key=lambda fit: float(np.nansum(fit.cost)))
+        chosen, world = min(fits, key=lambda item: float(np.nansum(item[1].cost)))
         if abs(math.log(world.scale)) > _UNIT_LOG or np.nanmean(world.cost) > _MAX_WAY_COST:
             return None
-        self._side_confidence = confidence_of(world, plain)
-        return reading if self._side_confidence > SURE else None
+        sure = confidence_of(world, plain)
+        if sure <= SURE:
+            return None
+        self._side_confidence = sure
+        return chosen
