@@ -74,7 +74,9 @@ def figure(rows: int = 1, columns: int = 1, *, width: float = 6.4, height: float
 
 
 def save_figure(made: Figure, path: Path) -> None:
-    """Write a PNG and say where."""
+    """Write a PNG, without panels that nothing is drawn in, and say where."""
+    for axis in made.axes:
+        axis.set_visible(axis.has_data())
     made.savefig(path)
     print(f"wrote {path}")
 
