@@ -128,23 +128,6 @@ def _rows(path):
         return list(csv.DictReader(file))
 
 
-def test_verdict_prints_models_that_can_be_pasted(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(_verdict_trials, "SIZES", (120,))
-    kinds = ["--fit-kinds", "harbour", "--check-kinds", "harbour", "--overlaps", "0.7"]
-    few = ["--seeds", "1", "--checks", "1", "--places", "1", "--check-places", "0"]
-    assert main(["verdict", "--out", str(tmp_path), *few, *kinds]) == 0
-    printed = capsys.readouterr().out
-    assert "pose=(" in printed
-    assert "match=(" in printed
-    assert (tmp_path / "reliability.png").read_bytes()[:4] == b"\x89PNG"
-    for name in ("fit.csv", "check.csv"):
-        rows = _rows(tmp_path / name)
-        assert {row["noise"] for row in rows} == {"clean", "noisy", "hard"}
-        clean = [r for r in rows if r["noise"] == "clean" and r["is_matching"] == "True"]
-        assert {row["is_right"] for row in clean} == {"True"}
-        assert {r["is_right"] for r in rows if r["is_matching"] == "False"} == {"False"}
-
-
 def test_verdict_reads_real_pairs_from_a_list(tmp_path):
     pair = make_pair("harbour", 0.7, "clean", 1, size_cells=60)
     for name, occupancy in (("one", pair.source), ("other", pair.target)):
