@@ -76,13 +76,15 @@ def reported(domain_id, *program):
 
 @pytest.mark.parametrize("node", _CLASSES)
 def test_a_node_that_starts_loads_nothing_large(node, ros_domain_id):
-    # A first start writes its byte code, and others may be busy: the quickest of each counts.
-    reports, least_s = [], []
+    # A first start writes its byte code, and others may be busy: it may try again.
     for _ in range(_ATTEMPTS):
-        reports.append(reported(ros_domain_id, _REPORT, node, _CLASSES[node]))
-        least_s.append(reported(ros_domain_id, _LEAST))
-    modules, imported_mb, started_mb, _ = reports[0]
-    assert not set(_LARGE) & set(modules)
-    assert imported_mb <= _IMPORTED_MB
-    assert started_mb <= _STARTED_MB
-    assert min(report[3] for report in reports) <= _MOST_TIMES_LEAST * min(least_s)
+        modules, imported_mb, started_mb, used_s = reported(
+            ros_domain_id, _REPORT, node, _CLASSES[node]
+        )
+        assert not set(_LARGE) & set(modules)
+        assert imported_mb <= _IMPORTED_MB
+        assert started_mb <= _STARTED_MB
+        allowed_s = _MOST_TIMES_LEAST * reported(ros_domain_id, _LEAST)
+        if used_s <= allowed_s:
+            return
+    pytest.fail(f"started in {used_s:.2f} s of computing, expected at most {allowed_s:.2f} s")
