@@ -339,8 +339,9 @@ def test_same_input_same_bytes():
         assert a == b
 
 
-@pytest.mark.parametrize("blind_s", [1.5, 2.0, 5.0, 20.0])
-@pytest.mark.parametrize("first_yaw_rad", [-2.5, 0.3, 2.0])
+@pytest.mark.parametrize(
+    ("blind_s", "first_yaw_rad"), [(1.5, -2.5), (2.0, 0.3), (5.0, 2.0), (20.0, -2.5)]
+)
 def test_a_compass_that_wakes_late_turns_nothing(blind_s, first_yaw_rad):
     """Its zero is another than that of the frame, which was begun without it."""
     rng = np.random.default_rng(0)
