@@ -119,8 +119,8 @@ class Client:
 
 @pytest.fixture(scope="module")
 def mission(tmp_path_factory):
-    """Two vehicles that survey mostly the same water, with a small sonar: 200 pings each."""
-    config = replace(tiny_mission_config(1), duration_s=100.0)
+    """Two vehicles that survey mostly the same water, with a small sonar: 140 pings each."""
+    config = replace(tiny_mission_config(1), duration_s=70.0)
     return simulate_mission(tmp_path_factory.mktemp("mission"), config, num_processes=2)
 
 
@@ -196,7 +196,7 @@ def test_bags_become_one_map_that_is_true(graph, mission, tmp_path):
     for vehicle in VEHICLES:
         response = client.call(Trigger, f"/{vehicle}/sonar_mapper/finish")
         assert response.success, response.message
-        assert response.message.startswith("200 pings mapped"), response.message
+        assert response.message.startswith("140 pings mapped"), response.message
         assert response.message.endswith(" 0 bad messages")
     client.until(
         lambda: client.statuses[-1].num_waiting == 0 and client.statuses[-1].num_in_flight == 0,
