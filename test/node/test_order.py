@@ -43,8 +43,7 @@ def messages():
 
 ORDERS = {
     "in turn": (0, 2, 4, 1, 3, 5, 6),
-    "backwards, and some twice": (6, 5, 4, 4, 3, 2, 6, 1, 0, 3),
-    "the first one when all others are joined": (2, 4, 1, 3, 5, 6, 0),
+    "backwards, some twice": (6, 5, 4, 4, 3, 2, 6, 1, 3, 0),  # the first one joins the others last
 }
 
 
