@@ -9,7 +9,7 @@ from uw_dslam_ros2.cli.study import main
 
 @pytest.mark.slow
 def test_every_stage_is_drawn_and_scored(tmp_path, capsys):
-    arguments = ["--vehicles", "1", "--duration", "20"]
+    arguments = ["--vehicles", "1", "--duration", "12"]
     assert main(["chart", "--out", str(tmp_path), *arguments]) == 0
     with (tmp_path / "chart.csv").open() as file:
         rows = {row["stage"]: row for row in csv.DictReader(file)}
