@@ -180,6 +180,17 @@ def test_an_imu_and_a_velocity_in_north_and_east_are_both_told(recording):
     }
 
 
+def test_a_velocity_against_water_that_moves_is_told(recording):
+    navigation, pings = recording
+    yaw = np.interp(navigation.velocity_s, navigation.imu_s, navigation.yaw_rad)
+    current = np.array([turned(np.array([0.15, -0.1]), -a) for a in yaw])
+    found = examine(replace(navigation, velocity_m_s=navigation.velocity_m_s + current), pings)
+    assert [f.kind for f in found.findings] == ["dvl_in_water"]
+    said = float(found.findings[0].detail.split()[2])
+    assert said == pytest.approx(math.hypot(0.15, 0.1), abs=0.03)
+    assert found.conventions.changes() == {}
+
+
 def test_without_an_orientation_a_velocity_along_the_worlds_axes_is_only_told(recording):
     navigation, pings = recording
     yaw = np.interp(navigation.velocity_s, navigation.imu_s, navigation.yaw_rad)

@@ -28,6 +28,7 @@ from uw_dslam_ros2.core.doctor.judging.turn_errors import (
 )
 from uw_dslam_ros2.core.doctor.judging.turns_and_times import say_delays, say_one_flipped
 from uw_dslam_ros2.core.doctor.judging.velocities import (
+    judge_current,
     judge_offset,
     say_in_world,
     say_mirrored,
@@ -191,6 +192,8 @@ class _Trial:
         if fit is None:
             return
         if not chosen.is_velocity_in_world:
+            if judge_current(self._result, fit):
+                return
             late_s = delays.velocity_after_imu_s
             before = judge_knock(
                 self._result,

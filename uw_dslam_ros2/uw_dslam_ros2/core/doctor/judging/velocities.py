@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.examination import Examination, words_of
 from uw_dslam_ros2.core.doctor.judging.scales import confidence_in
-from uw_dslam_ros2.core.doctor.motions.fits import VelocityFit
+from uw_dslam_ros2.core.doctor.motions.fits import SURE, VelocityFit, confidence_of_lead
 
-__all__ = ["judge_offset", "say_in_world", "say_mirrored"]
+__all__ = ["judge_current", "judge_offset", "say_in_world", "say_mirrored"]
 
 FloatArray = NDArray[np.float64]
 
@@ -19,6 +19,7 @@ _MIN_OFFSET_RAD = math.radians(2.5)
 _MIN_COARSE_OFFSET_RAD = math.radians(15.0)
 """Where the echoes' motions are far too short, they are only as good as that."""
 _COARSE_SCALE = 0.2
+_MIN_CURRENT_M_S = 0.1
 
 
 def judge_offset(result: Examination, fit: VelocityFit, velocity_m_s: FloatArray) -> None:
@@ -60,6 +61,27 @@ def judge_offset(result: Examination, fit: VelocityFit, velocity_m_s: FloatArray
             confidence_in(offset, sigma),
             velocity_yaw_offset_rad=round(offset, 4),
         )
+
+
+def judge_current(result: Examination, fit: VelocityFit) -> bool:
+    """Tell of a velocity that is measured against water that moves; whether it is."""
+    sure = confidence_of_lead(fit.current_lead, fit.repeats)
+    is_all = fit.current_lead > 0.4 * float(np.nansum(fit.cost))
+    if (
+        sure <= SURE
+        or not is_all
+        or fit.current_m_s < max(_MIN_CURRENT_M_S, 6.0 * fit.current_sigma_m_s)
+    ):
+        return False
+    result.tell(
+        "dvl_in_water",
+        "velocity",
+        f"a steady {fit.current_m_s:.2f} m/s in one direction of the world is missing in it or is "
+        "too much, by how the echoes move: it is measured against water that moves, not against "
+        "the ground; set the dvl to bottom track",
+        sure,
+    )
+    return True
 
 
 def say_mirrored(result: Examination, fit: VelocityFit, confidence: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +67,11 @@ class VelocityFit:
     is_mirrored: bool
     cost: FloatArray
     repeats: float = 1.0
+    current_m_s: float = 0.0
+    """A steady velocity along the world's axes that explains more, beside the factor."""
+    current_sigma_m_s: float = math.inf
+    current_lead: float = 0.0
+    """By how much less the motions cost with it."""
 
     @property
     def yaw_rad(self) -> float:
@@ -199,11 +205,18 @@ def fit_velocity(
     weight = _weights(motions, sonar_yaw_rad, is_sonar_mirrored)
     if usable.sum() < 8:
         return None
-    factor, sigma, cost = _solve(predicted[usable], seen[usable], weight[usable])
+    factor, sigma, cost = _solve([predicted[usable]], seen[usable], weight[usable])[0]
+    drifted = np.exp(-1j * yaw[begin]) * (end - begin) * _STEP_S
+    both = _solve([predicted[usable], drifted[usable]], seen[usable], weight[usable])
+    current, current_sigma, with_current = both[1]
     costs = np.full(len(motions), np.nan)
     costs[usable] = cost
     sigma *= math.sqrt(motions.repeats)
-    return VelocityFit(factor, sigma, is_velocity_mirrored, costs, motions.repeats)
+    return VelocityFit(
+        factor, sigma, is_velocity_mirrored, costs, motions.repeats,
+        abs(current), current_sigma * math.sqrt(motions.repeats),
+        float(cost.sum() - with_current.sum()),
+    )  # fmt: skip
 
 
 def _path(
@@ -230,25 +243,33 @@ def _weights(motions: PingMotions, sonar_yaw_rad: float, is_mirrored: bool) -> F
 
 
 def _solve(
-    predicted: ComplexArray, seen: ComplexArray, weight: FloatArray
-) -> tuple[complex, float, FloatArray]:
-    """Robust least squares of ``seen = factor * predicted``."""
-    x, y = predicted.real, predicted.imag
-    design = np.stack([np.stack([x, -y], axis=1), np.stack([y, x], axis=1)], axis=1)
+    known: Sequence[ComplexArray], seen: ComplexArray, weight: FloatArray
+) -> list[tuple[complex, float, FloatArray]]:
+    """Robust least squares of ``seen = sum of factor * known``: each factor, its sigma, costs."""
+    columns = []
+    for own in known:
+        x, y = own.real, own.imag
+        columns += [np.stack([x, y], axis=1), np.stack([-y, x], axis=1)]
+    design = np.stack(columns, axis=2)
     target = np.stack([seen.real, seen.imag], axis=1)
-    trust = np.ones(len(x))
-    factor = np.zeros(2)
+    weak = 1e-9 * np.eye(len(columns))
+    trust = np.ones(len(seen))
+    factor = np.zeros(len(columns))
     for _ in range(_ITERATIONS):
         normal = np.einsum("m,mki,mkl,mlj->ij", trust, design, weight, design)
         side = np.einsum("m,mki,mkl,ml->i", trust, design, weight, target)
-        factor = np.linalg.solve(normal + 1e-9 * np.eye(2), side)
+        factor = np.linalg.solve(normal + weak, side)
         error = target - design @ factor
         squares = np.einsum("mk,mkl,ml->m", error, weight, error)
         trust = 1.0 / (1.0 + squares / 4.0)
     # The residuals say how good the figures are that went in.
     spread = max(1.0, float(np.median(squares)) / 1.39)
-    sigma = math.sqrt(spread * float(np.linalg.inv(normal + 1e-9 * np.eye(2)).trace()) / 2.0)
-    return complex(factor[0], factor[1]), sigma, _robust(squares)
+    variance = spread * np.diag(np.linalg.inv(normal + weak))
+    cost = _robust(squares)
+    return [
+        (complex(*factor[i : i + 2]), math.sqrt(float(variance[i : i + 2].sum()) / 2.0), cost)
+        for i in range(0, len(columns), 2)
+    ]
 
 
 def confidence_of[FitT: (TurnFit, VelocityFit)](better: FitT, worse: FitT) -> float:
