@@ -38,6 +38,26 @@ def test_worker_survives_a_bad_job_and_tells():
     assert [type(error) for error in told] == [ZeroDivisionError]
 
 
+def test_worker_survives_whoever_gives_up_waiting():
+    worker, begun, gate = Worker("test", print), threading.Event(), threading.Event()
+    done = []
+
+    def job():
+        begun.set()
+        return gate.wait(PATIENCE_S)
+
+    running = worker.call(job)
+    waiting = worker.call(lambda: done.append("begun though nobody waits"))
+    assert begun.wait(PATIENCE_S)
+    assert waiting.cancel()
+    assert not running.cancel()
+    gate.set()
+    assert running.result(PATIENCE_S)
+    assert worker.call(lambda: "alive").result(PATIENCE_S) == "alive"
+    worker.close(PATIENCE_S)
+    assert not done
+
+
 def test_closing_worker_cancels_what_waits():
     worker, begun, gate = Worker("test", print), threading.Event(), threading.Event()
 

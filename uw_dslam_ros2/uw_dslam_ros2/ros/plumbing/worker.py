@@ -63,6 +63,8 @@ class Worker:
             future, job = item
             if self._is_closing.is_set():
                 future.cancel()
+            # A job that nobody waits for any more is not begun; one that has begun is ended.
+            if not future.set_running_or_notify_cancel():
                 continue
             try:
                 future.set_result(job())
