@@ -48,8 +48,7 @@ def read_scan(msg: Any, settings: ReadSettings) -> Sequence[ScanEvent | BeamsEve
     if range_max_m == 0.0:
         return ()
     angles = values[0] + values[1] * np.arange(len(ranges), dtype=np.float64)
-    if (offset_s := _offsets(msg, settings, len(ranges))) is None:
-        return ()
+    offset_s = _offsets(msg, settings, len(ranges))
     if len(ranges) > 1 and abs(offset_s[-1] - offset_s[0]) < ONE_MOMENT_S:
         return (ScanEvent(*key_of(msg, settings), angles, ranges, range_max_m),)
     stamps = stamp_of(msg) + np.round(offset_s * 1e9).astype(np.int64)
@@ -85,8 +84,8 @@ def _farthest(ranges: FloatArray, settings: ReadSettings) -> float:
     return found
 
 
-def _offsets(msg: Any, settings: ReadSettings, num_rays: int) -> FloatArray | None:
-    """Time of each ray after the stamp [s]; None where only the next turn will show it."""
+def _offsets(msg: Any, settings: ReadSettings, num_rays: int) -> FloatArray:
+    """Time of each ray after the stamp [s]."""
     increment_s, period_s = float(msg.time_increment), float(msg.scan_time)
     if not np.isfinite((increment_s, period_s)).all():
         raise InvalidInputError(
@@ -98,21 +97,23 @@ def _offsets(msg: Any, settings: ReadSettings, num_rays: int) -> FloatArray | No
         # A fan of one moment also has a scan_time, the time to the next one: only a turn is
         # spread over it.
         if period_s == 0.0:
-            if (period_s := _time_between(msg, settings)) < 0.0:
-                return None
-            period_s = period_s if period_s > _LONG_TURN_S else 0.0
+            between_s = _time_between(msg, settings)
+            period_s = between_s if between_s > _LONG_TURN_S else 0.0
         increment_s = period_s / num_rays
     offsets = increment_s * np.arange(num_rays, dtype=np.float64)
     return offsets - offsets[-1] if settings.scan_stamp == "last" else offsets
 
 
 def _time_between(msg: Any, settings: ReadSettings) -> float:
-    """The least time [s] from one message of this topic to the next so far; -1: not known yet."""
+    """The least time [s] from one message of this topic to the next so far; 0 of the first.
+
+    So the first turn is taken for one moment: nobody knows yet whether the sonar turns.
+    """
     stamp_ns = stamp_of(msg)
     last_ns = settings.memory.get("turn_ns")
     settings.memory["turn_ns"] = stamp_ns
     if last_ns is None:
-        return -1.0
+        return 0.0
     least_s = float(settings.memory.get("turn_s", np.inf))
     if stamp_ns > last_ns:
         least_s = settings.memory["turn_s"] = min(least_s, (stamp_ns - last_ns) * 1e-9)
