@@ -309,6 +309,34 @@ def test_cells_of_tables_hold_the_greatest_of_the_fields_cells(size):
 
 
 @pytest.mark.usefixtures("at_any_cost")
+@pytest.mark.parametrize("num_layers", [1, 3, len(sweep_module._WIDTHS)])
+def test_turned_squares_hold_what_they_reach_and_nothing_behind_the_tables(num_layers):
+    rng = np.random.default_rng(num_layers)
+    values, theta, delta, first = rng.integers(0, 1000, (30, 24), np.int16), 0.4, 0.25, -20
+    found = []
+    for behind in (-30000, 30000):
+        memory = np.full((num_layers + 2, *values.shape), behind, np.int16)
+        tables = memory[:num_layers]
+        for table, width in zip(tables, sweep_module._WIDTHS.tolist(), strict=False):
+            sweep_kernels.widen(values, width - 1, width - 1, table)
+        single = np.empty((45, 45), np.int16)
+        sweep_kernels.turned_maxima(
+            theta, delta, np.array([first, first, 45, 45]), 1.0, tables,
+            np.array([0.0, 0.0, 24.0, 30.0]), np.array([11.0, 13.0]),
+            sweep_module._LAYER_OF_WIDTH, 0.01, single,
+        )  # fmt: skip
+        found.append(single)
+    np.testing.assert_array_equal(*found)
+    for _ in range(3000):
+        col, row = rng.integers(0, 45, 2)
+        ux, uy = first + np.array([col, row]) + rng.random(2)
+        angle = theta + rng.uniform(-delta, delta)
+        cos, sin = math.cos(angle), math.sin(angle)
+        x, y = math.floor(cos * ux + sin * uy + 11.0), math.floor(cos * uy - sin * ux + 13.0)
+        if 0 <= x < 24 and 0 <= y < 30:
+            assert values[y, x] <= found[0][row, col]
+
+
 def test_a_sweep_keeps_its_level_where_it_may_not_go_on():
     problem = of_kind("noise", np.random.default_rng(61))
     assert not Sweep(problem, 10).advance(-math.inf)

@@ -292,6 +292,8 @@ def turned_maxima(
     flat, stride = tables.ravel(), np.int32(num_cols)
     layers = (layer_of_width * (num_rows * num_cols)).astype(np.int32)
     widest = np.int32(layers.shape[0] - 1)
+    while layer_of_width[widest] >= tables.shape[0]:
+        widest -= np.int32(1)
     first_row, first_col = frame[0], frame[1]
     first_u, last_u = fold * first_col, fold * (first_col + cols)
     far_u, stay = max(abs(first_u), abs(last_u)), 1.0 - versine
