@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.mapping.scans.match_kernels import (
-    climb,
-    score_poses,
-    score_window,
-)
+from uw_dslam_ros2.core.mapping.scans.match_kernels import score_poses, score_window
 from uw_dslam_ros2.core.mapping.scans.matcher import LikelihoodField, Prior, match_points, thin
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -155,69 +151,3 @@ def test_same_input_same_bytes():
 def test_a_field_of_nothing_is_refused():
     with pytest.raises(InvalidInputError, match="needs points"):
         LikelihoodField(np.empty((0, 2)), np.empty(0), 0.1)
-
-
-def climbed_slowly(field, points, start, mean, information, share, size, max_steps):
-    """The same ascent with numpy, all differences taken one by one."""
-
-    def posterior(pose):
-        score = field.scores(points, np.ones(len(points)), pose[None])[0]
-        return share * score - 0.5 * (pose - mean) @ information @ (pose - mean)
-
-    pose, damping = start, 1e-3
-    units = np.diag(0.5 * field.sigma_m / size)
-    prior = 0.5 * units @ information @ units
-    for _ in range(max_steps):
-        slope, second = np.zeros(3), np.zeros((3, 3))
-        for i in range(3):
-            slope[i] = (posterior(pose + units[i]) - posterior(pose - units[i])) / 2.0
-            second[i, i] = posterior(pose + units[i]) + posterior(pose - units[i])
-            second[i, i] -= 2.0 * posterior(pose)
-            for j in range(i):
-                both, apart = units[i] + units[j], units[i] - units[j]
-                mixed = posterior(pose + both) + posterior(pose - both)
-                mixed -= posterior(pose + apart) + posterior(pose - apart)
-                second[i, j] = second[j, i] = mixed / 4.0
-        values, vectors = np.linalg.eigh(second + 2.0 * prior)
-        curvature = (vectors * np.abs(values)) @ vectors.T + 2.0 * prior
-        for _ in range(5):
-            damped = curvature + damping * np.diag(np.diag(curvature))
-            step = units @ np.linalg.solve(damped, slope)
-            if posterior(pose + step) > posterior(pose):
-                pose, damping = pose + step, max(0.3 * damping, 1e-6)
-                break
-            damping *= 10.0
-        else:
-            return pose
-        if np.abs(step * size).max() < 1e-3 * field.sigma_m:
-            return pose
-    return pose
-
-
-@pytest.mark.parametrize("num_steps", [1, 12])
-@pytest.mark.parametrize("seed", range(5))
-def test_the_climb_is_the_slow_one(seed, num_steps):
-    rng = np.random.default_rng(seed)
-    field = LikelihoodField(corner(), np.ones(len(corner())), 2.0 * SIGMA)
-    points = corner()[:: 1 + seed]
-    start, mean = rng.normal(0.0, (0.2, 0.2, 0.03), (2, 3))
-    root = rng.normal(0.0, 1.0, (3, 3))
-    information, share, size = root @ root.T + np.eye(3), 0.1, np.array([1.0, 1.0, 3.0])
-    found = climb(
-        field.values, *field.origin, field.cell_m, points, np.ones(len(points)),
-        start, mean, information, share, size, field.sigma_m, num_steps,
-    )  # fmt: skip
-    expected = climbed_slowly(field, points, start, mean, information, share, size, num_steps)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    assert np.abs(found - start).max() > 0.005  # it went somewhere
-
-
-def test_a_climb_from_the_other_side_of_a_half_turn_is_the_same():
-    field = LikelihoodField(corner(), np.ones(len(corner())), 2.0 * SIGMA)
-    points, size = corner(), np.array([1.0, 1.0, 3.0])
-    start, mean, turn = np.array([0.1, 0.05, 0.02]), np.zeros(3), np.array([0.0, 0.0, 2 * np.pi])
-    ends = [
-        field.climbed(points, np.ones(len(points)), begin, mean, 5.0 * np.eye(3), 0.1, size)
-        for begin in (start, start + turn)
-    ]
-    np.testing.assert_allclose(ends[1] - turn, ends[0], atol=1e-9)

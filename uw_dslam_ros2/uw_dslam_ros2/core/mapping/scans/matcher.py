@@ -8,13 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.mapping.scans.match_kernels import (
-    climb,
-    derivatives,
-    score_poses,
-    score_window,
-    splat,
-)
+from uw_dslam_ros2.core.mapping.scans.match_kernels import score_poses, score_window, splat
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 __all__ = ["LikelihoodField", "Prior", "ScanMatch", "match_points", "thin"]
@@ -99,31 +93,6 @@ class LikelihoodField:
         """Sums of weighted values under points (N, 2) at each pose (K, 3)."""
         return score_poses(self.values, *self.origin, self.cell_m, points, weight, poses)
 
-    def derivatives(
-        self, points: FloatArray, weight: FloatArray, pose: FloatArray, steps: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Gradient (3,) and Hessian (3, 3) of the score at a pose, by differences over `steps`."""
-        _, gradient, hessian = derivatives(
-            self.values, *self.origin, self.cell_m, points, weight, pose, steps
-        )
-        return gradient, hessian
-
-    def climbed(
-        self,
-        points: FloatArray,
-        weight: FloatArray,
-        start: FloatArray,
-        mean: FloatArray,
-        information: FloatArray,
-        share: float,
-        size: FloatArray,
-    ) -> FloatArray:
-        """Pose (3,) on the peak of ``share * score`` + log prior that lies uphill of `start`."""
-        return climb(
-            self.values, *self.origin, self.cell_m, points, weight, start, mean, information,
-            share, size, self.sigma_m, _MAX_STEPS,
-        )  # fmt: skip
-
     def values_at(self, points: FloatArray) -> FloatArray:
         """Values (N,) of the cells that hold points (N, 2); 0 outside."""
         cells = np.floor((points - self.origin) / self.cell_m).astype(np.int64)
@@ -183,7 +152,6 @@ def match_points(
     scale = np.sqrt(np.mean(np.sum((source - source.mean(axis=0)) ** 2, axis=1))) + 1e-3
     prior_information = np.linalg.inv(prior.covariance)
     mean = prior.T_target_source.as_array()
-    size = np.array([1.0, 1.0, float(scale)])
 
     starts = _search(
         target[0],
@@ -199,8 +167,15 @@ def match_points(
     for start in starts:
         pose = start
         for field in target:
-            pose = field.climbed(
-                source, weight, pose, mean, prior_information, information_share, size
+            pose = _climb(
+                field,
+                source,
+                weight,
+                pose,
+                mean,
+                prior_information,
+                information_share,
+                float(scale),
             )
         value = float(target[-1].scores(source, weight, pose[None])[0])
         delta = _difference(pose, mean)
@@ -216,7 +191,7 @@ def match_points(
             lead = min(lead, (value - other_value) / max(value, 1e-9))
     field = target[-1]
     pose, information = _polish(
-        field, source, weight, pose, prior_information, information_share, size
+        field, source, weight, pose, prior_information, information_share, float(scale)
     )
     T_target_source = SE2.from_array(pose)
     single = field.values_at(T_target_source.apply(source))
@@ -275,6 +250,49 @@ def _search(
     return starts
 
 
+def _derivatives(
+    field: LikelihoodField,
+    source: FloatArray,
+    weight: FloatArray,
+    pose: FloatArray,
+    h_m: float,
+    scale: float,
+) -> tuple[float, FloatArray, FloatArray]:
+    """Score, gradient (3,) and Hessian (3, 3) by central differences.
+
+    The step `h_m` smooths the jumps between cells.
+    """
+    steps = np.array([h_m, h_m, h_m / scale])
+    offsets = [np.zeros(3)]
+    for i in range(3):
+        offsets += [_unit(i), -_unit(i)]
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    for i, j in pairs:
+        offsets += [
+            _unit(i) + _unit(j),
+            -_unit(i) - _unit(j),
+            _unit(i) - _unit(j),
+            _unit(j) - _unit(i),
+        ]
+    s = field.scores(source, weight, pose + np.array(offsets) * steps)
+    gradient = np.array([(s[1 + 2 * i] - s[2 + 2 * i]) / 2.0 for i in range(3)]) / steps
+    hessian = np.zeros((3, 3))
+    for i in range(3):
+        hessian[i, i] = (s[1 + 2 * i] + s[2 + 2 * i] - 2.0 * s[0]) / steps[i] ** 2
+    for k, (i, j) in enumerate(pairs):
+        plus, minus, mixed, dexim = s[7 + 4 * k : 11 + 4 * k]
+        hessian[i, j] = hessian[j, i] = (plus + minus - mixed - dexim) / (
+            4.0 * steps[i] * steps[j]
+        )
+    return float(s[0]), gradient, hessian
+
+
+def _unit(i: int) -> FloatArray:
+    unit = np.zeros(3)
+    unit[i] = 1.0
+    return unit
+
+
 def _polish(
     field: LikelihoodField,
     source: FloatArray,
@@ -282,7 +300,7 @@ def _polish(
     pose: FloatArray,
     prior_information: FloatArray,
     share: float,
-    size: FloatArray,
+    scale: float,
 ) -> tuple[FloatArray, FloatArray]:
     """From the posterior's peak to the likelihood's, along directions that the points know.
 
@@ -290,10 +308,11 @@ def _polish(
     known where the points say more than the prior; the information (3, 3) of others is zero. The
     derivatives are smooth over a sigma: interpolation between cells has its peaks at cells.
     """
+    size = np.array([1.0, 1.0, scale])
     start = pose
     known = np.zeros((3, 3))
     for _ in range(4):
-        gradient, hessian = field.derivatives(source, weight, pose, field.sigma_m / size)
+        _, gradient, hessian = _derivatives(field, source, weight, pose, field.sigma_m, scale)
         values, vectors = np.linalg.eigh(-share * hessian / np.outer(size, size))
         prior_values = np.einsum(
             "ik,ij,jk->k", vectors, prior_information / np.outer(size, size), vectors
@@ -306,3 +325,44 @@ def _polish(
             break
         pose = pose + step
     return pose, known
+
+
+def _climb(
+    field: LikelihoodField,
+    source: FloatArray,
+    weight: FloatArray,
+    pose: FloatArray,
+    mean: FloatArray,
+    prior_information: FloatArray,
+    share: float,
+    scale: float,
+) -> FloatArray:
+    """Damped Newton ascent of share * score + log prior."""
+    damping = 1e-3
+    size = np.array([1.0, 1.0, scale])
+    best = share * float(field.scores(source, weight, pose[None])[0])
+    delta = _difference(pose, mean)
+    best -= 0.5 * float(delta @ prior_information @ delta)
+    for _ in range(_MAX_STEPS):
+        _, gradient, hessian = _derivatives(
+            field, source, weight, pose, 0.5 * field.sigma_m, scale
+        )
+        values, vectors = np.linalg.eigh(-share * hessian / np.outer(size, size))
+        curvature = (vectors * np.abs(values)) @ vectors.T * np.outer(
+            size, size
+        ) + prior_information
+        slope = share * gradient - prior_information @ _difference(pose, mean)
+        moved = False
+        for _ in range(5):
+            step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), slope)
+            trial = pose + step
+            delta = _difference(trial, mean)
+            value = share * float(field.scores(source, weight, trial[None])[0])
+            value -= 0.5 * float(delta @ prior_information @ delta)
+            if value > best:
+                pose, best, damping, moved = trial, value, max(damping * 0.3, 1e-6), True
+                break
+            damping = min(damping * 10.0, 1e6)
+        if not moved or np.abs(step * size).max() < 1e-3 * field.sigma_m:
+            break
+    return pose
