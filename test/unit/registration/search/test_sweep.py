@@ -308,7 +308,6 @@ def test_cells_of_tables_hold_the_greatest_of_the_fields_cells(size):
         assert greatest <= table[2 + row, 2 + col] * unit <= greatest + 2.0 * unit
 
 
-@pytest.mark.usefixtures("at_any_cost")
 @pytest.mark.parametrize("num_layers", [1, 3, len(sweep_module._WIDTHS)])
 def test_turned_squares_hold_what_they_reach_and_nothing_behind_the_tables(num_layers):
     rng = np.random.default_rng(num_layers)
@@ -337,6 +336,7 @@ def test_turned_squares_hold_what_they_reach_and_nothing_behind_the_tables(num_l
             assert values[y, x] <= found[0][row, col]
 
 
+@pytest.mark.usefixtures("at_any_cost")
 def test_a_sweep_keeps_its_level_where_it_may_not_go_on():
     problem = of_kind("noise", np.random.default_rng(61))
     assert not Sweep(problem, 10).advance(-math.inf)
