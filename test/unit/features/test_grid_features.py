@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.features.grid_filter import clean_cells, coarsen
+from uw_dslam_ros2.core.features.grid_filter import clean_cells, clean_masks, coarsen
 from uw_dslam_ros2.core.features.grid_points import POINT_METHODS, grid_points
 from uw_dslam_ros2.core.features.walls import wall_points
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
@@ -65,6 +65,17 @@ def test_coarse_cells_keep_place_and_area():
     rows, cols = np.nonzero(coarse.wall > 0.25)
     np.testing.assert_allclose(coarse.row[rows, cols] * 0.25, 20.5 * 0.1, atol=1e-6)
     assert coarse.free.sum() * 0.25**2 == pytest.approx(cells.free.sum() * 0.1**2, rel=0.05)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.7, 2.0, 3.0])
+def test_masks_are_made_larger_as_shares_are(ratio):
+    occupancy = _map(_wall())
+    size_m = ratio * occupancy.spec.resolution_m
+    by_masks, by_shares = (coarsen(f(occupancy), size_m) for f in (clean_masks, clean_cells))
+    for name in ("wall", "free", "known", "row", "col"):
+        found, expected = getattr(by_masks, name), getattr(by_shares, name)
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_cells_of_the_same_size_pass_unchanged():

@@ -84,7 +84,7 @@ def write_report(
         }
     )
     if has_pictures:
-        trim()
+        trim()  # scores and walls have left holes
         images = _draw(outcome, facts, truth, scores)
         if outcome.global_map is not None:
             figure = walls_picture(outcome.global_map, walls, piers)

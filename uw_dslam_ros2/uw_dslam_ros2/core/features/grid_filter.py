@@ -15,7 +15,7 @@ from uw_dslam_ros2.core.grid import OccupancyMap
 __all__ = ["FilteredCells", "clean_cells", "clean_masks", "coarsen", "split"]
 
 FloatGrid = NDArray[np.float32]
-Shares = NDArray[Any]  # float32; or uint8 where each is 0 or 1
+Shares = NDArray[Any]
 
 # The paper's maps and map_server agree on decided cells; between the two lies "contradicting
 # echoes".
@@ -31,8 +31,8 @@ class FilteredCells:
     """Evidence of a grid's cells, each array (R, C) float32 in [0, 1].
 
     ``wall`` is that of a wall somewhere in the cell, ``free`` and ``known`` are shares of the
-    cell's area. ``row`` and ``col`` tell where in the cell the wall lies, in cells from the grid's
-    outer corner.
+    cell's area, uint8 as `clean_masks` gives them. ``row`` and ``col`` tell where in the cell the
+    wall lies, in cells from the grid's outer corner.
     """
 
     resolution_m: float
@@ -163,14 +163,16 @@ def coarsen(cells: FilteredCells, resolution_m: float) -> FilteredCells:
     if ratio < 1.0 + 1e-9:
         return _with_shares(cells)
     whole = round(ratio)
-    arrays = (cells.wall, cells.free, cells.known, cells.row, cells.col)
     if abs(ratio - whole) < 1e-9 * ratio:
-        sums = _whole_block_sums(*arrays, whole)  # much quicker
+        sums = _whole_block_sums(  # much quicker
+            cells.wall, cells.free, cells.known, cells.row, cells.col, whole
+        )
     else:
         starts = [_block_starts(size, ratio) for size in cells.shape]
         cells = _with_shares(cells)
-        wall, free, known, row, col = cells.wall, cells.free, cells.known, cells.row, cells.col
-        counted = (wall, free, known, wall * row, wall * col, np.ones(cells.shape, np.float32))
+        wall = cells.wall
+        places = wall * cells.row, wall * cells.col
+        counted = (wall, cells.free, cells.known, *places, np.ones(cells.shape, np.float32))
         sums = np.stack([_block_sum(values, starts) for values in counted])
     wall_sum, free_sum, known_sum, row_sum, col_sum, count = sums
     weight = np.maximum(wall_sum, np.float32(1e-9))
