@@ -21,7 +21,14 @@ from uw_dslam_ros2.core.doctor.turning.kernels import mean_nearness
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["BeamSample", "TurningFit", "TurningReading", "TurningTrial", "choose_windows"]
+__all__ = [
+    "MAX_DELAY_S",
+    "BeamSample",
+    "TurningFit",
+    "TurningReading",
+    "TurningTrial",
+    "choose_windows",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -40,7 +47,8 @@ _STEP_S = 0.1
 _COARSE_M, _MIDDLE_M, _FINE_M = 2.0, 0.8, 0.4
 _COARSE_STEP = 5
 """Where the kernel is wide, a fifth of the pairs says the same."""
-_MAX_DELAY_S = 2.0
+MAX_DELAY_S = 2.0
+"""Of the heading, as long as any that is tried."""
 _CLIMB = (
     (_COARSE_M, math.radians(5.0), 0.5),
     (_MIDDLE_M, math.radians(2.0), 0.25),
@@ -140,7 +148,7 @@ class _Window:
         self._bearing, self._range_m = beams.bearing_rad[inside], beams.range_m[inside]
         self._mount = beams.T_base_sonar
         self._imu_s, self._yaw = navigation.imu_s, yaw_rad
-        lead_s = _MAX_DELAY_S + 1.0
+        lead_s = MAX_DELAY_S + 1.0
         first_s, last_s = (self._stamp_s[0], self._stamp_s[-1]) if len(inside) else (0.0, 0.0)
         self._grid = np.arange(first_s - lead_s, last_s + lead_s, _STEP_S)
         velocity = navigation.velocity_m_s
@@ -247,7 +255,7 @@ class TurningTrial:
                 around = (
                     replace(here, offset_rad=here.offset_rad + i * step_rad, delay_s=delay_s)
                     for i, j in _AROUND
-                    if abs(delay_s := round(here.delay_s + j * step_s, 3)) <= _MAX_DELAY_S
+                    if abs(delay_s := round(here.delay_s + j * step_s, 3)) <= MAX_DELAY_S
                 )
                 better = self._best(around, width_m)
                 if better.mean <= best.mean:

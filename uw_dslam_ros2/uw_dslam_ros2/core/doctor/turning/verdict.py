@@ -15,6 +15,7 @@ from uw_dslam_ros2.core.doctor.motions.delays import late_in_words
 from uw_dslam_ros2.core.doctor.motions.fits import SURE
 from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
 from uw_dslam_ros2.core.doctor.turning.turns import (
+    MAX_DELAY_S,
     BeamSample,
     TurningFit,
     TurningTrial,
@@ -28,7 +29,8 @@ FloatArray = NDArray[np.float64]
 _SHARED = 1.5
 """Windows overlap by half, so that so many of them count as one."""
 _MIN_OFFSET_RAD, _SIGMAS = math.radians(4.0), 4.0
-_MIN_DELAY_S, _END_OF_SEARCH_S = 0.15, 1.95
+_MIN_DELAY_S = 0.15
+_AT_END_S = 0.05  # of the longest delay that is tried: it may be longer
 
 
 def examine_turning(
@@ -194,12 +196,12 @@ class _Judge:
         sure = confidence_of(best, still)
         if abs(delay_s - known_s) < _MIN_DELAY_S or sure < SURE:
             return
-        if abs(delay_s) > _END_OF_SEARCH_S:
+        if abs(delay_s) > MAX_DELAY_S - _AT_END_S:
             self._result.tell(
                 "imu_delay",
                 "imu",
                 f"its stamps are {'later' if delay_s > 0.0 else 'earlier'} than the sonar's by "
-                f"{abs(delay_s):.0f} s or more: where a message holds a turn, its stamp may be "
+                f"{MAX_DELAY_S:.0f} s or more: where a message holds a turn, its stamp may be "
                 "that of the last beam (scan_stamp: last), or its beams' times are not told "
                 "(scan_period_s)",
                 sure,
