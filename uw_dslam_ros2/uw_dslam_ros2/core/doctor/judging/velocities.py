@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.examination import Examination, words_of
 from uw_dslam_ros2.core.doctor.judging.scales import confidence_in
-from uw_dslam_ros2.core.doctor.motions.fits import SURE, VelocityFit, confidence_of_lead
+from uw_dslam_ros2.core.doctor.motions.fits import (
+    SURE,
+    VelocityFit,
+    confidence_of_lead,
+    fit_current,
+)
 
 __all__ = ["judge_current", "judge_offset", "say_in_world", "say_mirrored"]
 
@@ -65,18 +70,16 @@ def judge_offset(result: Examination, fit: VelocityFit, velocity_m_s: FloatArray
 
 def judge_current(result: Examination, fit: VelocityFit) -> bool:
     """Tell of a velocity that is measured against water that moves; whether it is."""
-    sure = confidence_of_lead(fit.current_lead, fit.repeats)
-    is_all = fit.current_lead > 0.4 * float(np.nansum(fit.cost))
-    if (
-        sure <= SURE
-        or not is_all
-        or fit.current_m_s < max(_MIN_CURRENT_M_S, 6.0 * fit.current_sigma_m_s)
-    ):
+    current = fit_current(fit)
+    sure = confidence_of_lead(current.lead, fit.repeats)
+    is_much = current.lead > 0.4 * float(np.nansum(fit.cost))
+    is_clear = current.m_s >= max(_MIN_CURRENT_M_S, 6.0 * current.sigma_m_s)
+    if not (sure > SURE and is_much and is_clear):
         return False
     result.tell(
         "dvl_in_water",
         "velocity",
-        f"a steady {fit.current_m_s:.2f} m/s in one direction of the world is missing in it or is "
+        f"a steady {current.m_s:.2f} m/s in one direction of the world is missing in it or is "
         "too much, by how the echoes move: it is measured against water that moves, not against "
         "the ground; set the dvl to bottom track",
         sure,

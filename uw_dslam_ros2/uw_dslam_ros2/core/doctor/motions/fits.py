@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -21,6 +22,7 @@ __all__ = [
     "believed",
     "confidence_of",
     "confidence_of_lead",
+    "fit_current",
     "fit_turns",
     "fit_velocity",
     "turned",
@@ -53,6 +55,30 @@ class TurnFit:
     repeats: float = 1.0
 
 
+class Compared(NamedTuple):
+    """Motions (N,) that a velocity was fitted to, in base_link at their beginning.
+
+    ``measured`` [m] is by the velocity, ``seen`` [m] by echoes, with its information ``weight``
+    (N, 2, 2); ``drifted`` [s] is the way of 1 m/s along the world's x.
+    """
+
+    measured: ComplexArray
+    drifted: ComplexArray
+    seen: ComplexArray
+    weight: FloatArray
+
+
+class Current(NamedTuple):
+    """A steady velocity along the world's axes that explains more, beside a factor.
+
+    ``lead`` is by how much less the motions cost with it.
+    """
+
+    m_s: float
+    sigma_m_s: float
+    lead: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class VelocityFit:
     """``factor`` turns and scales the measured velocity to the one by echoes.
@@ -67,11 +93,7 @@ class VelocityFit:
     is_mirrored: bool
     cost: FloatArray
     repeats: float = 1.0
-    current_m_s: float = 0.0
-    """A steady velocity along the world's axes that explains more, beside the factor."""
-    current_sigma_m_s: float = math.inf
-    current_lead: float = 0.0
-    """By how much less the motions cost with it."""
+    compared: Compared | None = None
 
     @property
     def yaw_rad(self) -> float:
@@ -205,18 +227,22 @@ def fit_velocity(
     weight = _weights(motions, sonar_yaw_rad, is_sonar_mirrored)
     if usable.sum() < 8:
         return None
-    factor, sigma, cost = _solve([predicted[usable]], seen[usable], weight[usable])[0]
     drifted = np.exp(-1j * yaw[begin]) * (end - begin) * _STEP_S
-    both = _solve([predicted[usable], drifted[usable]], seen[usable], weight[usable])
-    current, current_sigma, with_current = both[1]
+    compared = Compared(predicted[usable], drifted[usable], seen[usable], weight[usable])
+    factor, sigma, cost = _solve([compared.measured], compared.seen, compared.weight)[0]
     costs = np.full(len(motions), np.nan)
     costs[usable] = cost
     sigma *= math.sqrt(motions.repeats)
-    return VelocityFit(
-        factor, sigma, is_velocity_mirrored, costs, motions.repeats,
-        abs(current), current_sigma * math.sqrt(motions.repeats),
-        float(cost.sum() - with_current.sum()),
-    )  # fmt: skip
+    return VelocityFit(factor, sigma, is_velocity_mirrored, costs, motions.repeats, compared)
+
+
+def fit_current(fit: VelocityFit) -> Current:
+    """What a current explains of the motions that `fit_velocity` compared."""
+    assert fit.compared is not None
+    measured, drifted, seen, weight = fit.compared
+    current, sigma, cost = _solve([measured, drifted], seen, weight)[1]
+    before = fit.cost[np.isfinite(fit.cost)]
+    return Current(abs(current), sigma * math.sqrt(fit.repeats), float(before.sum() - cost.sum()))
 
 
 def _path(
