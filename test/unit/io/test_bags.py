@@ -356,6 +356,45 @@ def test_what_a_stopped_driver_repeats_under_new_stamps_is_left_out_and_told(tmp
     assert [finding.kind for finding in reader.findings] == ["sonar_frozen", "dvl_frozen"]
 
 
+def test_images_that_a_viewer_repeats_at_its_own_rate_are_left_out_untold(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        messages = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+        for k in range(60):
+            stamp_ns = SECOND + k * SECOND // 5
+            image = sonar_image(stamp_ns, np.uint16, 50, 40)
+            image.intensity[0, 0] = k // 3
+            writer.write("/auv_1/sonar", stamp_ns, messages.sonar_image("auv_1/sonar", image))
+    (recording,) = recordings_of([tmp_path / "bag"])
+    with VehicleReader(recording) as reader:
+        images = [e.image.intensity[0, 0] for e in reader.events() if isinstance(e, ImageEvent)]
+    assert images == list(range(20))
+    assert not reader.findings
+
+
+def test_a_mounting_that_moves_late_is_seen_among_the_vehicles_own_motion(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        messages = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")
+        writer.add_topic("/tf", "tf2_msgs/msg/TFMessage")
+        for k in range(2000):
+            stamp_ns = SECOND + k * SECOND // 20
+            content = messages.imu(stamp_ns, "auv_1/imu", 0.1, 1e-4, 0.0, 1e-4)
+            writer.write("/auv_1/imu", stamp_ns, content)
+            moved = [("auv_1/base_link", (0.1 * k, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))]
+            writer.write("/tf", stamp_ns, messages.transforms(stamp_ns, "odom", moved))
+            if k % 3 == 0:
+                pan = [("auv_1/sonar", (0.0, 0.1 * (k > 1500), 0.0), (0.0, 0.0, 0.0, 1.0))]
+                content = messages.transforms(stamp_ns, "auv_1/base_link", pan)
+                writer.write("/tf", stamp_ns, content)
+    (recording,) = recordings_of([tmp_path / "bag"])
+    with VehicleReader(recording) as reader:
+        told = [e for e in reader.transforms() if e.child_frame_id == "auv_1/sonar"]
+    assert told[0].T_parent_child[1, 3] == 0.0
+    assert told[-1].T_parent_child[1, 3] == 0.1
+    assert len(told) < 500
+
+
 def test_empty_bag(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic("/auv_1/imu", "sensor_msgs/msg/Imu")

@@ -72,3 +72,38 @@ def test_points_in_the_frame_of_an_odometry_are_told():
     (finding,) = mountings.findings("auv_1")
     assert finding.severity == "warning"
     assert "'auv_1/odom' is not the vehicle's" in finding.detail
+
+
+def turned_by(angle_rad):
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]]
+    return T
+
+
+@pytest.mark.parametrize(("step_rad", "is_told"), [(0.0, False), (0.005, True)])
+def test_a_mounting_that_moves_bit_by_bit_is_told(step_rad, is_told):
+    mountings = Mountings("auv_1/base_link")
+    for k in range(100):
+        pan = turned_by(k * step_rad)
+        mountings.add(TransformEvent("auv_1", k, "auv_1/base_link", "auv_1/pan", pan))
+        mountings.add(TransformEvent("auv_1", k, "auv_1/pan", "auv_1/sonar", np.eye(4)))
+        # The vehicle's own motion, and a camera's, are no concern of the sonar's.
+        mountings.add(TransformEvent("auv_1", k, "odom", "auv_1/base_link", turned_by(0.1 * k)))
+        mountings.add(TransformEvent("auv_1", k, "auv_1/base_link", "camera", turned_by(0.1 * k)))
+    mountings.of(points("auv_1/sonar"))
+    found = mountings.findings("auv_1")
+    assert [f.kind for f in found] == ["mounting_moves"] * is_told
+    assert all("differ by up to 28 degrees" in f.detail for f in found)
+
+
+def test_two_vehicles_on_one_topic_are_told():
+    def kinds(*frames):
+        mountings = mounted("auv_1/sonar", "auv_1/sonar_up")
+        for frame_id in frames:
+            mountings.of(points(frame_id))
+        return [f.kind for f in mountings.findings("auv_1")]
+
+    assert "several_frames" in kinds(*["auv_1/sonar", "auv_2/sonar"] * 20)
+    # One that was set up anew, and two whose places are known.
+    assert "several_frames" not in kinds(*["auv_1/sonar"] * 20, *["auv_2/sonar"] * 20)
+    assert not kinds(*["auv_1/sonar", "auv_1/sonar_up"] * 20)

@@ -192,19 +192,26 @@ class StaticFrames:
         InvalidInputError
             If no chain leads from the frame up to the base.
         """
+        T_base_frame = np.eye(4)
+        for name in self.chain(base_frame_id, frame_id):
+            T_base_frame = self._parent[name][1] @ T_base_frame
+        return T_base_frame
+
+    def chain(self, base_frame_id: str, frame_id: str) -> list[str]:
+        """Frames whose transforms lead from `frame_id` up to the base, see `lookup`."""
         base_frame_id = base_frame_id.strip("/")
         vehicle_id = base_frame_id.rpartition("/")[0]
         known = self._parent.keys() | {parent for parent, _ in self._parent.values()}
         base = _named(base_frame_id, vehicle_id, known)
         here = _named(frame_id.strip("/"), vehicle_id, known | {base_frame_id})
-        T_here_frame = np.eye(4)
+        names: list[str] = []
         for _ in range(len(self._parent) + 1):
             if here in (base, base_frame_id):
-                return T_here_frame
+                return names
             if here not in self._parent:
                 break
-            here, T_parent_here = self._parent[here]
-            T_here_frame = T_parent_here @ T_here_frame
+            names.append(here)
+            here = self._parent[here][0]
         raise InvalidInputError(
             f"no static transform leads from {frame_id!r} to {base_frame_id!r}; "
             f"known frames: {', '.join(sorted(self._parent)) or 'none'}"

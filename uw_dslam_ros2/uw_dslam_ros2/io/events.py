@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
+import itertools
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -57,6 +58,8 @@ __all__ = [
 _SECOND_NS = 1_000_000_000
 _MAX_MOUNTINGS = 200
 """Messages of /tf that are read for mountings: it goes on at a high rate, and repeats them."""
+_NUM_LOOKS, _MOUNTINGS_A_LOOK = 20, 40
+"""Times at which it is looked at again, for mountings that move."""
 _RECENT = 4
 """Messages of a sensor that may be recorded again, by another recorder."""
 _TRUTH = "truth"
@@ -204,9 +207,7 @@ class VehicleReader:
                     and topic.endswith("tf_static") is is_latched
                     and self._is_mine(topic)
                 ]
-                for number, raw in enumerate(reader.raw(topics) if topics else ()):
-                    if number >= _MAX_MOUNTINGS and not is_latched:
-                        break
+                for raw in _transforms_in(reader, topics, is_latched=is_latched):
                     yield from _transforms_of(reader.deserialize(raw), self._recording.vehicle_id)
 
     def _is_mine(self, topic: str) -> bool:
@@ -284,6 +285,24 @@ def _stamp_of(reader: BagReader, raw: RawMessage) -> int:
     order = "<" if raw.data[1] & 1 else ">"
     seconds, nanoseconds = struct.unpack_from(f"{order}iI", raw.data, 4)
     return int(seconds) * _SECOND_NS + int(nanoseconds)
+
+
+def _transforms_in(
+    reader: BagReader, topics: Sequence[str], *, is_latched: bool
+) -> Iterator[RawMessage]:
+    """Messages with mountings: all that are latched, of others the first and some of later."""
+    if not topics:
+        return
+    if is_latched:
+        yield from reader.raw(topics)
+        return
+    starts_ns = np.linspace(reader.start_ns, reader.end_ns, _NUM_LOOKS + 1, dtype=np.int64)[:-1]
+    seen_ns = reader.start_ns - 1
+    for start_ns in starts_ns.tolist():
+        most = _MAX_MOUNTINGS if start_ns == reader.start_ns else _MOUNTINGS_A_LOOK
+        for raw in itertools.islice(reader.raw(topics, max(start_ns, seen_ns + 1)), most):
+            seen_ns = raw.stamp_ns
+            yield raw
 
 
 def _transforms_of(msg: Any, vehicle_id: str) -> Iterator[TransformEvent]:

@@ -13,11 +13,10 @@ from uw_dslam_ros2.io.readings import Event, ImageEvent, VelocityEvent
 __all__ = ["FrozenSensors"]
 
 _MANY_PIXELS = 1000
-_FEW_IMAGES = 5
-"""A driver may repeat an image now and then, when it missed one."""
 _FEW_VELOCITIES = 4
 """Drivers repeat a velocity until there is another."""
 _LONG_NS = 4_000_000_000
+"""Relays and viewers repeat what they have at a rate of their own; what is longer is missing."""
 
 
 class FrozenSensors:
@@ -29,11 +28,10 @@ class FrozenSensors:
 
     def __init__(self) -> None:
         self._checksum: int | None = None
-        self._num_images = 0
+        self._image_since_ns = self._longest_image_ns = 0
         self._velocity: tuple[float, ...] = ()
         self._num_alike = 0
-        self._since_ns = 0
-        self._longest_ns = 0
+        self._velocity_since_ns = self._longest_velocity_ns = 0
 
     def is_frozen(self, found: Sequence[Event]) -> bool:
         """Whether what a message says is only what the one before said."""
@@ -50,39 +48,42 @@ class FrozenSensors:
         pixels, before = event.image.intensity, self._checksum
         says_nothing = pixels.size < _MANY_PIXELS or pixels.min() == pixels.max()
         self._checksum = None if says_nothing else zlib.crc32(np.ascontiguousarray(pixels))
-        is_frozen = self._checksum is not None and self._checksum == before
-        self._num_images += is_frozen
-        return is_frozen
+        if self._checksum is None or self._checksum != before:
+            self._image_since_ns = event.stamp_ns
+            return False
+        alike_ns = event.stamp_ns - self._image_since_ns
+        self._longest_image_ns = max(self._longest_image_ns, alike_ns)
+        return True
 
     def _is_velocity_frozen(self, event: VelocityEvent) -> bool:
         velocity = tuple(event.velocity_m_s[:2].tolist())
         if velocity != self._velocity or not any(velocity):
-            self._velocity, self._num_alike, self._since_ns = velocity, 0, event.stamp_ns
+            self._velocity, self._num_alike = velocity, 0
+            self._velocity_since_ns = event.stamp_ns
             return False
         self._num_alike += 1
-        self._longest_ns = max(self._longest_ns, event.stamp_ns - self._since_ns)
+        alike_ns = event.stamp_ns - self._velocity_since_ns
+        self._longest_velocity_ns = max(self._longest_velocity_ns, alike_ns)
         return self._num_alike >= _FEW_VELOCITIES
 
     def findings(self) -> list[Finding]:
         """What to tell of it."""
         found = []
-        if self._num_images >= _FEW_IMAGES:
+        if self._longest_image_ns >= _LONG_NS:
             found.append(
-                Finding(
-                    "sonar_frozen",
-                    "sonar",
-                    "many of its images are the one before once more, to the last pixel, under a "
-                    "new stamp: its driver had stopped; they are left out",
-                )
+                _stopped("sonar_frozen", "sonar", "image", "pixel", self._longest_image_ns)
             )
-        if self._longest_ns >= _LONG_NS:
+        if self._longest_velocity_ns >= _LONG_NS:
             found.append(
-                Finding(
-                    "dvl_frozen",
-                    "velocity",
-                    f"its velocity stays the same to the last digit for up to "
-                    f"{self._longest_ns * 1e-9:.0f} s: its driver had stopped; what it repeats is "
-                    "left out",
-                )
+                _stopped("dvl_frozen", "velocity", "velocity", "digit", self._longest_velocity_ns)
             )
         return found
+
+
+def _stopped(kind: str, role: str, what: str, last: str, longest_ns: int) -> Finding:
+    return Finding(
+        kind,
+        role,
+        f"its {what} stays the same to the last {last}, under new stamps, for up to "
+        f"{longest_ns * 1e-9:.0f} s: its driver had stopped; what it repeats is left out",
+    )

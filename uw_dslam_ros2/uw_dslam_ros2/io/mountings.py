@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding, Severity
 from uw_dslam_ros2.core.mounting import StaticFrames, fan_tilt
+from uw_dslam_ros2.io.mounting_changes import MountingChanges
 from uw_dslam_ros2.io.readings import (
     DepthEvent,
     FixEvent,
@@ -84,12 +85,14 @@ class Mountings:
         self._base_frame_id = base_frame_id
         self._frames = StaticFrames()
         self._known: dict[tuple[type, str], FloatArray] = {}
+        self._changes = MountingChanges()
         self.unknown: dict[str, str] = {}
         self.taken_for: dict[str, tuple[str, str]] = {}
         self.tilted: dict[str, float] = {}
 
     def add(self, event: TransformEvent) -> None:
-        """Take a transform."""
+        """Take a transform; one that was told before is replaced."""
+        self._changes.note_transform(event.frame_id, event.child_frame_id, event.T_parent_child)
         self._frames.add(event.frame_id, event.child_frame_id, event.T_parent_child)
         self._known.clear()
         self.unknown.clear()
@@ -118,6 +121,8 @@ class Mountings:
     def of(self, event: Reading) -> FloatArray:
         """``T_base_sensor`` (4, 4) of the instrument that said this."""
         frame_id = _frame_of(event)
+        if not isinstance(event, _NEEDS_NONE):
+            self._changes.note_message(_topic_role(role_of(event)), frame_id)
         key = type(event), frame_id
         if key not in self._known:
             mounting = self._known[key] = self._mounting(event, frame_id)
@@ -170,7 +175,7 @@ class Mountings:
         return frame_id.strip("/") in ("", self._base_frame_id.strip("/"))
 
     def findings(self, vehicle_id: str) -> list[Finding]:
-        """What to tell of frames that are unknown, and of sonars that point up or down."""
+        """What to tell of frames that are unknown or move, and of sonars that are tilted."""
 
         def no_mounting(frame_id: str, word: str, told: str, severity: Severity) -> Finding:
             return Finding(
@@ -206,7 +211,17 @@ class Mountings:
             )
             for frame_id, tilt_rad in sorted(self.tilted.items())
         ]
-        return unknown + taken + tilted
+        strange = self.unknown.keys() | self.taken_for.keys()
+        return unknown + taken + tilted + self._changes.findings(vehicle_id, strange, self._chain)
+
+    def _chain(self, frame_id: str) -> list[str]:
+        """Frames between an instrument's and the body, as they were taken."""
+        try:
+            return self._frames.chain(
+                self._base_frame_id, self.taken_for.get(frame_id, ("", frame_id))[1]
+            )
+        except InvalidInputError:
+            return []
 
 
 def _topic_role(word: str) -> str:
