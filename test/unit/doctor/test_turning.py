@@ -96,6 +96,26 @@ def test_zero_direction_and_delay_are_found_together(zero_deg, seed):
     assert conventions.imu_delay_s == pytest.approx(0.8, abs=0.2)
 
 
+@pytest.mark.parametrize(
+    ("yaw_sign", "rate_sign", "expected"),
+    [
+        (-1.0, -1.0, {"imu_orientation": "ned", "imu_rates": "frd"}),
+        (-1.0, 1.0, {"imu_orientation": "ned"}),
+        (1.0, -1.0, {"imu_rates": "frd"}),
+        (math.nan, -1.0, {"imu_rates": "frd"}),
+        (-1.0, math.nan, {"imu_orientation": "ned"}),
+    ],
+)
+def test_a_heading_that_grows_clockwise_is_the_imus(yaw_sign, rate_sign, expected):
+    navigation, beams = recording(1)
+    wrong = replace(
+        navigation,
+        yaw_rad=yaw_sign * navigation.yaw_rad,
+        yaw_rate_rad_s=rate_sign * navigation.yaw_rate_rad_s,
+    )
+    assert examined(wrong, beams).conventions == Conventions(**expected)
+
+
 def test_the_zero_alone_is_found():
     turning = replace(TURN, zero_rad=math.radians(-60.0))
     found = examined(*recording(4, turning))

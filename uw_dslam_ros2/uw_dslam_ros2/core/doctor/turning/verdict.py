@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uw_dslam_ros2.core.doctor.examination import Examination
-from uw_dslam_ros2.core.doctor.judging.imu import compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.examination import Examination, words_of
+from uw_dslam_ros2.core.doctor.judging.imu import ImuState, compare_yaw_and_rate
 from uw_dslam_ros2.core.doctor.motions.delays import late_in_words
 from uw_dslam_ros2.core.doctor.motions.fits import SURE
 from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
@@ -43,7 +43,8 @@ def examine_turning(
 
     Nothing is added where too few turns can be compared, or no reading of them is clearly best.
     """
-    yaw = _yaw_of(result, navigation)
+    imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
+    yaw = _yaw_of(result, imu)
     if yaw is None:
         return
     if result.conventions.velocity_zero_is_invalid:
@@ -56,7 +57,7 @@ def examine_turning(
     trial = TurningTrial(beams, navigation, yaw, spans)
     result.num_turning_windows = trial.num_windows
     if trial.num_windows:
-        _Judge(result, trial, navigation).run()
+        _Judge(result, trial, navigation, imu).run()
 
 
 def choose_spans(navigation: NavigationSample, ping_s: FloatArray) -> list[tuple[float, float]]:
@@ -68,9 +69,8 @@ def choose_spans(navigation: NavigationSample, ping_s: FloatArray) -> list[tuple
     return choose_windows(float(ping_s[0]), float(ping_s[-1]), navigation.imu_s, yaw)
 
 
-def _yaw_of(result: Examination, navigation: NavigationSample) -> FloatArray | None:
+def _yaw_of(result: Examination, imu: ImuState) -> FloatArray | None:
     """Yaw (K,) by orientation, which does not drift, or by rates where it says nothing."""
-    imu = compare_yaw_and_rate(navigation.imu_s, navigation.yaw_rad, navigation.yaw_rate_rad_s)
     if imu.by_orientation is not None and result.conventions.imu_orientation != "none":
         return imu.by_orientation
     if imu.by_rates is None:
@@ -98,38 +98,69 @@ class _Judge:
         result: Examination,
         trial: TurningTrial,
         navigation: NavigationSample,
+        imu: ImuState,
     ) -> None:
-        self._result, self._trial = result, trial
+        self._result, self._trial, self._imu = result, trial, imu
         self._velocity_m_s = navigation.velocity_m_s
 
     def run(self) -> None:
-        best, other = sorted((self._trial.best(1), self._trial.best(-1)), key=lambda f: -f.mean)
-        if best.reading.side < 0 and confidence_of(best, other) < SURE:
-            best = other  # what is usual stays until it is clearly wrong
-        if best.reading.side < 0:
-            self._judge_side(best, other)
+        usual, other_way = self._trial.best(1), self._trial.best(-1)
+        starts = (
+            replace(other_way.reading, side=1, heading=-1, offset_rad=offset)
+            for offset in (0.0, -other_way.reading.offset_rad)
+        )
+        by_heading = max((self._trial.refined(start) for start in starts), key=lambda f: f.mean)
+        # What is usual stays until it is clearly wrong.
+        best = usual
+        sure = min(confidence_of(by_heading, usual), confidence_of(by_heading, other_way))
+        if sure > SURE:
+            best = by_heading
+            self._say_heading(sure)
+        else:
+            if (sure := confidence_of(other_way, usual)) > SURE:
+                best = other_way
+                self._say_other_way(sure, is_in_doubt=confidence_of(best, by_heading) < SURE)
+            if self._are_opposed and confidence_of(best, by_heading) > SURE:
+                self._say_rates(confidence_of(best, by_heading))
         self._judge_offset(best)
         self._judge_delay(best)
 
-    def _judge_side(self, best: TurningFit, other: TurningFit) -> None:
-        """Turns run backwards, or it is the heading that does: the sideways velocity tells."""
-        sure = confidence_of(best, other)
-        reading = best.reading
-        seen = replace(reading, side=1, heading=-1, offset_rad=-reading.offset_rad)
-        by_heading = self._trial.refined(seen)
-        if confidence_of(by_heading, best) > SURE:
-            self._result.tell(
-                "imu_ned",
-                "imu",
-                "it turns against the sonar's turns, which agree with one another and with the "
-                "sideways velocity if its yaw grows clockwise (conventions.imu_orientation: ned, "
-                "conventions.imu_rates: frd)",
-                confidence_of(by_heading, best),
-                imu_orientation="ned",
-                imu_rates="frd",
-            )
-            return
-        doubt = confidence_of(best, by_heading) < SURE
+    @property
+    def _is_by_orientation(self) -> bool:
+        is_said = self._imu.by_orientation is not None
+        return is_said and self._result.conventions.imu_orientation != "none"
+
+    @property
+    def _are_opposed(self) -> bool:
+        """Whether the rates turn against the orientation that the turns were tried with."""
+        return self._is_by_orientation and self._imu.ratio < 0.0
+
+    def _say_heading(self, sure: float) -> None:
+        changes = {}
+        if self._is_by_orientation:
+            changes["imu_orientation"] = "ned"
+        if self._imu.by_rates is not None and not self._are_opposed:
+            changes["imu_rates"] = "frd"
+        self._result.tell(
+            "imu_ned",
+            "imu",
+            "it turns against the sonar's turns, which agree with one another and with the "
+            f"sideways velocity if its yaw grows clockwise ({words_of(changes)})",
+            sure,
+            **changes,
+        )
+
+    def _say_rates(self, sure: float) -> None:
+        self._result.tell(
+            "imu_rates_frd",
+            "imu",
+            "its rates turn against its own yaw, with which the sonar's turns agree: their z "
+            "axis points down (conventions.imu_rates: frd)",
+            sure,
+            imu_rates="frd",
+        )
+
+    def _say_other_way(self, sure: float, *, is_in_doubt: bool) -> None:
         self._result.tell(
             "sonar_mirrored",
             "sonar",
@@ -138,7 +169,7 @@ class _Judge:
             + (
                 "; an imu that speaks ned would look alike here, so make sure that the map is not "
                 "a mirror image"
-                if doubt
+                if is_in_doubt
                 else ""
             ),
             sure,
