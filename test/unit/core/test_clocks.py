@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uw_dslam_ros2.core.clocks import StreamTimes, corrected_clocks, find_gaps
+from uw_dslam_ros2.core.clocks import StreamTimes, corrected_clocks, find_gaps, gaps_at_the_ends
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
@@ -151,6 +151,15 @@ def test_gaps_are_found_inside_and_at_the_ends():
     assert (gap.role, round(gap.seconds)) == ("imu", 30)
     (gap,) = find_gaps(truth | {"velocity": truth["velocity"][:-120]})
     assert (gap.role, round(gap.seconds)) == ("velocity", 20)
+
+
+def test_a_dvl_without_lock_is_told_of_at_the_ends_alone():
+    sonar_ns = np.arange(0, 240) * 500_000_000
+    said = (sonar_ns >= 30e9) & ((sonar_ns < 60e9) | (sonar_ns > 80e9)) & (sonar_ns < 100e9)
+    found = gaps_at_the_ends(sonar_ns, "velocity", sonar_ns[said])
+    assert [(g.role, round(g.seconds)) for g in found] == [("velocity", 30), ("velocity", 20)]
+    assert gaps_at_the_ends(sonar_ns, "velocity", sonar_ns) == []
+    assert gaps_at_the_ends(sonar_ns, "velocity", sonar_ns[:0]) == []
 
 
 @pytest.mark.parametrize(

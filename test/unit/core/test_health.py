@@ -57,6 +57,7 @@ def test_nothing_is_told_where_nothing_is_wrong():
             ("no_bottom_lock", "velocity"),
         ),
         ({"counts": COUNTS | {"num_pings_dropped": 1000}}, ("pings_dropped", "sonar")),
+        ({"counts": COUNTS | {"num_pings_blind": 90}}, ("pings_blind", "imu")),
         ({"counts": COUNTS | {"num_pings_empty": 360}}, ("no_echoes", "sonar")),
         ({"counts": COUNTS | {"num_matches": 14}}, ("few_matches", "sonar")),
         ({"counts": COUNTS | {"num_imu_outliers": 9000}}, ("outliers", "imu")),

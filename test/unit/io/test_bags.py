@@ -372,6 +372,26 @@ def test_images_that_a_viewer_repeats_at_its_own_rate_are_left_out_untold(tmp_pa
     assert not reader.findings
 
 
+def test_white_images_are_told_and_not_taken_for_those_of_a_stopped_driver(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        messages = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
+        for k in range(100):
+            stamp_ns = SECOND + k * SECOND // 2
+            image = sonar_image(stamp_ns, np.uint8, 50, 40)
+            image.intensity[:] = np.random.default_rng(k).integers(0, 200, (50, 40))
+            if k > 60:
+                image.intensity[5:] = 255
+                image.intensity[:5] = 0
+            writer.write("/auv_1/sonar", stamp_ns, messages.sonar_image("auv_1/sonar", image))
+    (recording,) = recordings_of([tmp_path / "bag"])
+    with VehicleReader(recording) as reader:
+        assert len([e for e in reader.events() if isinstance(e, ImageEvent)]) == 100
+    (finding,) = reader.findings
+    assert finding.kind == "sonar_saturated"
+    assert finding.detail.startswith("39 of 100 images")
+
+
 def test_a_mounting_that_moves_late_is_seen_among_the_vehicles_own_motion(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         messages = MessageFactory(writer.typestore)

@@ -16,7 +16,7 @@ from uw_dslam_ros2.core.stamp_fields import (
     why_useless,
 )
 
-__all__ = ["Gap", "StreamTimes", "corrected_clocks", "find_gaps"]
+__all__ = ["Gap", "StreamTimes", "corrected_clocks", "find_gaps", "gaps_at_the_ends"]
 
 IntArray = NDArray[np.int64]
 
@@ -218,3 +218,16 @@ def find_gaps(stamps: Mapping[str, IntArray]) -> list[Gap]:
         for index in np.flatnonzero(np.diff(edges) > least_ns):
             gaps.append(Gap(role, int(edges[index]), int(edges[index + 1])))
     return gaps
+
+
+def gaps_at_the_ends(sonar_ns: IntArray, role: str, said_ns: IntArray) -> list[Gap]:
+    """Silences of `find_gaps` before a sensor says something for the first time, and at the end.
+
+    ``said_ns`` (K,) are the times of those of its messages that say something, ``sonar_ns`` (N,)
+    those of the pings.
+    """
+    if not len(sonar_ns) or not len(said_ns):
+        return []
+    ends = int(sonar_ns.min()), int(sonar_ns.max())
+    gaps = find_gaps({"sonar": sonar_ns, role: said_ns})
+    return [g for g in gaps if g.role == role and (g.start_ns == ends[0] or g.end_ns == ends[1])]

@@ -51,7 +51,8 @@ class MappedVehicle:
     gaps : silences of its sensors.
     spans : first and last stamp [ns] of each role.
     trajectory_stamp_ns, trajectory : (K,) and (K, 3) of the vehicle at its pings.
-    has_yaw, has_yaw_rate : whether any message of the imu had them.
+    has_yaw, has_yaw_rate : whether any message of the imu had them, that was read.
+    is_yaw_left_out : whether its orientation is left out by the conventions.
     """
 
     vehicle_id: str
@@ -63,6 +64,7 @@ class MappedVehicle:
     trajectory: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
     has_yaw: bool = True
     has_yaw_rate: bool = True
+    is_yaw_left_out: bool = False
 
     def count(self, name: str) -> int:
         """One of the mapper's counters; 0 where it has none."""
@@ -131,11 +133,15 @@ def _check_sensors(vehicle: MappedVehicle, tell: _Tell) -> None:
         elif not has_heading:
             tell("no_heading", "imu", "its messages have neither orientation nor rates")
         elif not vehicle.has_yaw:
+            why = (
+                "its orientation is left out (conventions.imu_orientation: none)"
+                if vehicle.is_yaw_left_out
+                else "its messages have no orientation"
+            )
             tell(
                 "no_heading",
                 "imu",
-                "its messages have no orientation: the heading is integrated from its rates, and "
-                "drifts",
+                f"{why}: the heading is integrated from its rates, and drifts",
             )
         if "velocity" not in sensors:
             tell("no_velocity", "velocity", "there is no dvl and no odometry: speed is guessed")
@@ -194,6 +200,14 @@ def _check_pings(vehicle: MappedVehicle, tell: _Tell) -> None:
             "sonar",
             f"{dropped} of {mapped + dropped} pings are not used, because there was no navigation "
             "at their time or their stamps do not rise",
+        )
+    blind = vehicle.count("num_pings_blind")
+    if blind >= _MANY:
+        tell(
+            "pings_blind",
+            "imu",
+            f"{blind} of {mapped + dropped + blind} pings are not mapped, because it says nothing "
+            "of the heading then",
         )
     empty = vehicle.count("num_pings_empty")
     if mapped and empty == mapped:

@@ -1,11 +1,13 @@
-"""Drivers that stopped and repeat what they said last, under new stamps."""
+"""Readings that say nothing: of drivers that stopped and repeat themselves, and white images."""
 
 from __future__ import annotations
 
 import zlib
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.io.readings import Event, ImageEvent, VelocityEvent
@@ -15,6 +17,8 @@ __all__ = ["FrozenSensors"]
 _MANY_PIXELS = 1000
 _FEW_VELOCITIES = 4
 """Drivers repeat a velocity until there is another."""
+_WHITE, _SOME, _FEW = 0.5, 20, 0.05
+"""Share of an image's pixels; images, and their share, that are worth telling."""
 _LONG_NS = 4_000_000_000
 """Relays and viewers repeat what they have at a rate of their own; what is longer is missing."""
 
@@ -27,6 +31,9 @@ class FrozenSensors:
     """
 
     def __init__(self) -> None:
+        self._num_images = 0
+        self._num_even: Counter[float] = Counter()
+        self._top = 0.0
         self._checksum: int | None = None
         self._image_since_ns = self._longest_image_ns = 0
         self._velocity: tuple[float, ...] = ()
@@ -46,7 +53,7 @@ class FrozenSensors:
 
     def _is_image_frozen(self, event: ImageEvent) -> bool:
         pixels, before = event.image.intensity, self._checksum
-        says_nothing = pixels.size < _MANY_PIXELS or pixels.min() == pixels.max()
+        says_nothing = pixels.size < _MANY_PIXELS or self._is_even(pixels)
         self._checksum = None if says_nothing else zlib.crc32(np.ascontiguousarray(pixels))
         if self._checksum is None or self._checksum != before:
             self._image_since_ns = event.stamp_ns
@@ -54,6 +61,15 @@ class FrozenSensors:
         alike_ns = event.stamp_ns - self._image_since_ns
         self._longest_image_ns = max(self._longest_image_ns, alike_ns)
         return True
+
+    def _is_even(self, pixels: NDArray[np.generic]) -> bool:
+        """Whether most of an image is one value, its largest: black, or white."""
+        top = float(pixels.max())
+        is_even = bool(np.mean(pixels == top) > _WHITE)
+        self._num_images += 1
+        self._num_even[top] += is_even
+        self._top = max(self._top, top)
+        return is_even
 
     def _is_velocity_frozen(self, event: VelocityEvent) -> bool:
         velocity = tuple(event.velocity_m_s[:2].tolist())
@@ -76,6 +92,17 @@ class FrozenSensors:
         if self._longest_velocity_ns >= _LONG_NS:
             found.append(
                 _stopped("dvl_frozen", "velocity", "velocity", "digit", self._longest_velocity_ns)
+            )
+        num_white = self._num_even[self._top] if self._top > 0.0 else 0
+        if num_white >= max(_SOME, _FEW * self._num_images):
+            found.append(
+                Finding(
+                    "sonar_saturated",
+                    "sonar",
+                    f"{num_white} of {self._num_images} images are white, more than half of "
+                    "their pixels at the largest value: the gain is too high, and nothing is seen "
+                    "in them",
+                )
             )
         return found
 

@@ -15,6 +15,8 @@ from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from uw_dslam_ros2.cli.common import num_processors, num_workers
 from uw_dslam_ros2.cli.running.examining import (
     ExaminedVehicle,
@@ -24,7 +26,7 @@ from uw_dslam_ros2.cli.running.examining import (
     together,
 )
 from uw_dslam_ros2.core.chart.pings import DrawnPing, KeptPings
-from uw_dslam_ros2.core.clocks import find_gaps
+from uw_dslam_ros2.core.clocks import find_gaps, gaps_at_the_ends
 from uw_dslam_ros2.core.errors import DataError, InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.health import MappedVehicle, SensorCount, health_findings
@@ -41,7 +43,7 @@ from uw_dslam_ros2.io.examining import mended
 from uw_dslam_ros2.io.feeding import feed_runs, in_stamp_order
 from uw_dslam_ros2.io.heap import trim
 from uw_dslam_ros2.io.mountings import role_of
-from uw_dslam_ros2.io.readings import DepthEvent, FixEvent
+from uw_dslam_ros2.io.readings import DepthEvent, FixEvent, VelocityEvent
 from uw_dslam_ros2.io.sensor_settings import SensorConfig
 from uw_dslam_ros2.io.settings import SettingsFile
 from uw_dslam_ros2.io.vehicles import VehicleRecording
@@ -199,6 +201,7 @@ def map_recording(
     newest: dict[SubmapId, Submap] = {}
     fixes: list[FixEvent] = []
     depths_m: list[float] = []
+    locked_ns: list[int] = []
     number = 0
     has_yaw = has_yaw_rate = False
     first_ns: int | None = None
@@ -222,6 +225,8 @@ def map_recording(
                 continue
             if isinstance(event, DepthEvent) and math.isfinite(event.depth_m):
                 depths_m.append(event.depth_m)
+            if isinstance(event, VelocityEvent) and np.isfinite(event.velocity_m_s).all():
+                locked_ns.append(event.stamp_ns)
             first_ns = event.stamp_ns if first_ns is None else first_ns
             if isinstance(event, ImuEvent):
                 late_s = (event.stamp_ns - first_ns) * 1e-9
@@ -244,6 +249,10 @@ def map_recording(
     stamps_ns, poses = runs.trajectory()
     sensor_stamps = {r: stamps[stamps > 0] for r, stamps in reader.stamps.items()}
     sensor_stamps = {role: stamps for role, stamps in sensor_stamps.items() if len(stamps)}
+    gaps = find_gaps(sensor_stamps)
+    if "sonar" in sensor_stamps:
+        locked = np.array(locked_ns, np.int64)
+        gaps += gaps_at_the_ends(sensor_stamps["sonar"], "velocity", locked)
     vehicle = MappedVehicle(
         recording.vehicle_id,
         {
@@ -254,12 +263,13 @@ def map_recording(
             if count.num and role != "truth"
         },
         diagnostics,
-        find_gaps(sensor_stamps),
+        tuple(dict.fromkeys(gaps)),
         {role: (int(s.min()), int(s.max())) for role, s in sensor_stamps.items()},
         stamps_ns,
         poses,
         has_yaw=has_yaw,
         has_yaw_rate=has_yaw_rate,
+        is_yaw_left_out=reader.conventions.imu_orientation == "none",
     )
     findings = [
         dataclasses.replace(finding, vehicle_id=recording.vehicle_id)
