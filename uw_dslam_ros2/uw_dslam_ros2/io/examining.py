@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, SampleCollector, examine
+from uw_dslam_ros2.core.doctor.judging.climb import Climb
 from uw_dslam_ros2.core.doctor.judging.lean import Lean
 from uw_dslam_ros2.core.doctor.motions.ping_motion import have_echoes
 from uw_dslam_ros2.core.doctor.samples.bursts import choose_pings, more_pings
@@ -82,7 +83,7 @@ def examine_readings(
     vehicle_id: str = "",
 ) -> Examination:
     """Try the conventions of a vehicle's sensors; parameters as in `examine_recording`."""
-    collector, leaning = SampleCollector(sonar), Lean()
+    collector, leaning, climbing = SampleCollector(sonar), Lean(), Climb()
     changes: dict[str, Any] = {}
     is_axis_open = False
 
@@ -108,6 +109,8 @@ def examine_readings(
                     and event.orientation_xyzw is not None
                 ):
                     leaning.add(event.orientation_xyzw, mounting[:3, :3])
+                if not changes and isinstance(event, VelocityEvent):
+                    climbing.add(event.frame_id, mounting[:3, :3] @ event.velocity_m_s)
                 feed(collector, event, mounting)  # type: ignore[arg-type]  # has a mapper's inputs
                 if isinstance(event, PoseEvent):
                     collector.note_frame(event.frame_id, event.height_m)
@@ -137,6 +140,7 @@ def examine_readings(
     found = examine(collector.navigation(), collector.pings(), vehicle_id, odometry)
     leaning.tell(found)
     leaning.tell_slight(found)
+    climbing.tell(found)
     if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):
         found.is_turning = True
         spans = choose_spans(navigation, collector.seconds(np.unique(stamps["sonar"])))
