@@ -77,6 +77,13 @@ def test_a_gap_in_which_the_vehicle_stood_still_is_no_harm():
     assert found(gaps=(gap,), trajectory=np.zeros((121, 3))) == []
 
 
+@pytest.mark.parametrize(("num_early", "is_told"), [(500, False), (300, True)])
+def test_a_dvl_needs_no_lock_before_the_dive(num_early, is_told):
+    count = SensorCount(720, num_empty=540, num_early=num_early)
+    told = found(sensors=SENSORS | {"velocity": count})
+    assert told == [("no_bottom_lock", "velocity")] * is_told
+
+
 def test_a_filter_of_its_own_needs_no_imu_and_no_dvl():
     sensors = {"sonar": SENSORS["sonar"], "odometry": SensorCount(1200)}
     assert found(sensors=sensors, has_yaw=False, has_yaw_rate=False) == []

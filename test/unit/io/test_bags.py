@@ -392,6 +392,21 @@ def test_white_images_are_told_and_not_taken_for_those_of_a_stopped_driver(tmp_p
     assert finding.detail.startswith("39 of 100 images")
 
 
+def test_what_a_dvl_does_not_say_is_counted_before_and_after_its_first_velocity(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        messages = MessageFactory(writer.typestore)
+        writer.add_topic("/auv_1/dvl", "marine_acoustic_msgs/msg/Dvl")
+        for k in range(30):
+            velocity = None if k < 10 or k > 25 else (1.0, 0.01 * k)
+            content = messages.dvl((k + 1) * SECOND, "auv_1/dvl", velocity, 1e-4, 3.0)
+            writer.write("/auv_1/dvl", (k + 1) * SECOND, content)
+    (recording,) = recordings_of([tmp_path / "bag"])
+    with VehicleReader(recording) as reader:
+        assert len(list(reader.events())) == 16
+        count = reader.counts["velocity"]
+    assert (count.num, count.num_empty, count.num_early) == (30, 14, 10)
+
+
 def test_a_mounting_that_moves_late_is_seen_among_the_vehicles_own_motion(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         messages = MessageFactory(writer.typestore)

@@ -211,6 +211,7 @@ class _Messages:
                 num_bad,
                 max(count.num_empty, known.num_empty),
                 known.problem or count.problem,
+                max(count.num_early, known.num_early),
             )
 
     def vehicle(

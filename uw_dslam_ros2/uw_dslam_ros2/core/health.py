@@ -27,12 +27,17 @@ _NAVIGATION = ("velocity", "imu", "odometry")
 
 @dataclass(frozen=True, slots=True)
 class SensorCount:
-    """What became of one sensor's messages: all, bad ones, and those that said nothing."""
+    """What became of one sensor's messages: all, bad ones, and those that said nothing.
+
+    ``num_early`` of ``num_empty`` came before the first one that said something: a DVL has no
+    lock on deck.
+    """
 
     num: int
     num_bad: int = 0
     num_empty: int = 0
     problem: str = ""
+    num_early: int = 0
 
     @property
     def num_useful(self) -> int:
@@ -153,11 +158,12 @@ def _check_sensors(vehicle: MappedVehicle, tell: _Tell) -> None:
                 f"{count.num_bad} of {count.num} messages are malformed and left out; "
                 f"the first: {count.problem}",
             )
-        if role == "velocity" and count.num >= _MANY and count.num_useful < _MOST * count.num:
+        num = count.num - count.num_early
+        if role == "velocity" and num >= _MANY and count.num_useful < _MOST * num:
             tell(
                 "no_bottom_lock",
                 role,
-                f"only {count.num_useful} of {count.num} messages hold a velocity over ground",
+                f"only {count.num_useful} of {num} messages hold a velocity over ground",
             )
 
 

@@ -122,13 +122,16 @@ def read_events(
 class MessageCount:
     """What became of a sensor's messages; `problem` is that of the first bad one.
 
-    `num_read` are those of `num` that were wanted.
+    `num_read` are those of `num` that were wanted; `num_early` those of `num_empty` that came
+    before the first one that said something.
     """
 
     num: int = 0
     num_read: int = 0
     num_bad: int = 0
     num_empty: int = 0
+    num_early: int = 0
+    has_said: bool = False
     num_repeated: int = 0
     problem: str = ""
 
@@ -255,6 +258,8 @@ class VehicleReader:
             usual = [correct(event, self.conventions) for event in found]
             kept = [event for event in usual if event is not None]
             count.num_empty += not kept
+            if kept and not count.has_said:
+                count.has_said, count.num_early = True, count.num_empty
             yield from kept
         self.findings += frozen.findings()
 

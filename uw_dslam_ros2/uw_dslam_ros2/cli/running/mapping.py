@@ -257,7 +257,11 @@ def map_recording(
         recording.vehicle_id,
         {
             role: SensorCount(
-                count.num - count.num_repeated, count.num_bad, count.num_empty, count.problem
+                count.num - count.num_repeated,
+                count.num_bad,
+                count.num_empty,
+                count.problem,
+                count.num_early,
             )
             for role, count in reader.counts.items()
             if count.num and role != "truth"
