@@ -8,9 +8,14 @@ import pytest
 
 from uw_dslam_ros2.core.conventions import Conventions
 from uw_dslam_ros2.core.doctor import Examination, NavigationSample
+from uw_dslam_ros2.core.doctor.judging.odometry import OdometrySample
 from uw_dslam_ros2.core.doctor.turning.kernels import mean_nearness
 from uw_dslam_ros2.core.doctor.turning.turns import BeamSample
-from uw_dslam_ros2.core.doctor.turning.verdict import choose_spans, examine_turning
+from uw_dslam_ros2.core.doctor.turning.verdict import (
+    choose_spans,
+    examine_turning,
+    examine_turning_by_odometry,
+)
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.sim.missions.mission import (
     T_BASE_DVL,
@@ -114,6 +119,25 @@ def test_a_heading_that_grows_clockwise_is_the_imus(yaw_sign, rate_sign, expecte
         yaw_rate_rad_s=rate_sign * navigation.yaw_rate_rad_s,
     )
     assert examined(wrong, beams).conventions == Conventions(**expected)
+
+
+@pytest.mark.parametrize(
+    ("side", "height_m", "kinds"),
+    [(1.0, -3.0, []), (-1.0, 3.0, ["odometry_ned"]), (-1.0, -3.0, ["sonar_mirrored"])],
+)
+def test_poses_of_a_filter_that_turn_against_the_sonar_are_told(side, height_m, kinds):
+    navigation, beams = recording(2)
+    odometry = OdometrySample(
+        navigation.imu_s,
+        side * navigation.yaw_rad,
+        navigation.velocity_s,
+        navigation.velocity_m_s * np.array([1.0, side]),
+        np.full(len(navigation.imu_s), height_m),
+    )
+    found = Examination()
+    spans = choose_spans(odometry.as_navigation(), beams.stamp_s)
+    examine_turning_by_odometry(found, odometry, beams, spans)
+    assert [f.kind for f in found.findings] == kinds
 
 
 def test_the_zero_alone_is_found():

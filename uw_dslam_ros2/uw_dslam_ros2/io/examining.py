@@ -15,7 +15,11 @@ from uw_dslam_ros2.core.doctor.judging.climb import Climb
 from uw_dslam_ros2.core.doctor.judging.lean import Lean
 from uw_dslam_ros2.core.doctor.motions.ping_motion import have_echoes
 from uw_dslam_ros2.core.doctor.samples.bursts import choose_pings, more_pings
-from uw_dslam_ros2.core.doctor.turning.verdict import choose_spans, examine_turning
+from uw_dslam_ros2.core.doctor.turning.verdict import (
+    choose_spans,
+    examine_turning,
+    examine_turning_by_odometry,
+)
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.sonar import SonarConfig
@@ -143,10 +147,15 @@ def examine_readings(
     climbing.tell(found)
     if "sonar" in stamps and (collector.is_turning or _are_slow(stamps["sonar"])):
         found.is_turning = True
-        spans = choose_spans(navigation, collector.seconds(np.unique(stamps["sonar"])))
+        is_alone = not len(navigation.imu_s) and len(odometry.stamp_s) > 1
+        known = odometry.as_navigation() if is_alone else navigation
+        spans = choose_spans(known, collector.seconds(np.unique(stamps["sonar"])))
         inside = _inside(spans, collector.start_ns)
         collect(lambda role, stamp_ns: role == "sonar" and inside(stamp_ns))
-        examine_turning(found, navigation, collector.beams(), spans)
+        if is_alone:
+            examine_turning_by_odometry(found, odometry, collector.beams(), spans)
+        else:
+            examine_turning(found, navigation, collector.beams(), spans)
     if is_axis_open:
         found.findings = [
             replace(f, severity="info") if f.kind == "dvl_mirrored" else f for f in found.findings

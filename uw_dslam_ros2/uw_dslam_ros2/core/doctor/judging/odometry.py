@@ -26,7 +26,7 @@ from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
 from uw_dslam_ros2.core.findings import Finding
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["OdometrySample", "examine_odometry"]
+__all__ = ["OdometrySample", "examine_odometry", "say_mirrored"]
 
 FloatArray = NDArray[np.float64]
 
@@ -58,6 +58,13 @@ class OdometrySample:
             return np.full(len(self.yaw_rad), math.nan)
         rates = np.diff(np.unwrap(self.yaw_rad)) / np.maximum(np.diff(self.stamp_s), 1e-3)
         return np.append(rates, rates[-1])
+
+    def as_navigation(self) -> NavigationSample:
+        """The same as what an IMU without rates and a DVL would say."""
+        unknown = np.full(len(self.yaw_rad), math.nan)
+        return NavigationSample(
+            self.stamp_s, self.yaw_rad, unknown, self.velocity_s, self.velocity_m_s
+        )
 
     @property
     def is_z_down(self) -> bool | None:
@@ -101,11 +108,11 @@ class _Judge:
         turns = believed(fit_turns(self._motions, self._odometry.stamp_s, yaw))
         if turns is None:
             if self._odometry.is_named_ned:
-                self._say_ned("its frame is named so", 1.0, "info")
+                _say_ned(self._result, "its frame is named so", 1.0, "info")
             return
         sign, owner = turns[0].sign, ""
         if sign < 0:
-            owner = self._say_mirrored(confidence_of(turns[0], turns[1]))
+            owner = say_mirrored(self._result, self._odometry, confidence_of(turns[0], turns[1]))
         if not is_alone:
             return
         self._judge_delay(turns)
@@ -130,57 +137,6 @@ class _Judge:
             self._result.is_velocity_judged = True
             self._judge_offset(fit)
             self._judge_scale(fit)
-
-    def _say_mirrored(self, confidence: float) -> Literal["odometry", "sonar"]:
-        """Tell whether the odometry or the sonar is the wrong way round.
-
-        A mirrored path and a mirrored sonar make the same map but for a mirror, so that echoes do
-        not tell: the frame's name does, or on which side of the surface it has the vehicle.
-        Without either the odometry is taken for NED, which is common, and the map may be mirrored.
-        """
-        is_z_down = self._odometry.is_z_down
-        if self._odometry.is_named_ned:
-            self._say_ned("its frame is named so, and the echoes agree", confidence, "info")
-        elif is_z_down:
-            self._say_ned(
-                "the sonar's echoes turn against it, and its z grows downwards", confidence
-            )
-        elif is_z_down is False:
-            self._result.tell(
-                "sonar_mirrored",
-                "sonar",
-                "its echoes turn against the odometry, whose z grows upwards as it should: port "
-                "and starboard are exchanged, or it hangs upside down "
-                "(conventions.sonar_is_mirrored: true)",
-                confidence,
-                sonar_is_mirrored=True,
-            )
-            return "sonar"
-        else:
-            self._result.tell(
-                "handedness",
-                "odometry",
-                "the sonar's echoes turn against it: either it is north, east, down "
-                "(conventions.odometry: ned), which is the likelier, or the sonar's port and "
-                "starboard are exchanged (conventions.sonar_is_mirrored: true instead): then the "
-                "map is mirrored",
-                0.5,
-                odometry="ned",
-            )
-        return "odometry"
-
-    def _say_ned(
-        self, why: str, confidence: float, severity: Literal["info", "warning"] = "warning"
-    ) -> None:
-        finding = Finding(
-            "odometry_ned",
-            "odometry",
-            f"its poses are north, east, down: {why} (conventions.odometry: ned)",
-            confidence,
-            severity,
-            self._result.vehicle_id,
-        )
-        self._result.add(finding, odometry="ned")
 
     def _judge_delay(self, turns: list[TurnFit]) -> None:
         delay_s, sure = turns[0].delay_s, confidence_of(turns[0], turns[2])
@@ -222,3 +178,61 @@ class _Judge:
             confidence_in(fit.scale - 1.0, fit.factor_sigma),
             sonar_range_scale=round(1.0 / fit.scale, 4),
         )
+
+
+def say_mirrored(
+    result: Examination, odometry: OdometrySample, confidence: float
+) -> Literal["odometry", "sonar"]:
+    """Tell whether the odometry or the sonar is the wrong way round.
+
+    A mirrored path and a mirrored sonar make the same map but for a mirror, so that echoes do
+    not tell: the frame's name does, or on which side of the surface it has the vehicle.
+    Without either the odometry is taken for NED, which is common, and the map may be mirrored.
+    """
+    is_z_down = odometry.is_z_down
+    if odometry.is_named_ned:
+        _say_ned(result, "its frame is named so, and the echoes agree", confidence, "info")
+    elif is_z_down:
+        _say_ned(
+            result, "the sonar's echoes turn against it, and its z grows downwards", confidence
+        )
+    elif is_z_down is False:
+        result.tell(
+            "sonar_mirrored",
+            "sonar",
+            "its echoes turn against the odometry, whose z grows upwards as it should: port "
+            "and starboard are exchanged, or it hangs upside down "
+            "(conventions.sonar_is_mirrored: true)",
+            confidence,
+            sonar_is_mirrored=True,
+        )
+        return "sonar"
+    else:
+        result.tell(
+            "handedness",
+            "odometry",
+            "the sonar's echoes turn against it: either it is north, east, down "
+            "(conventions.odometry: ned), which is the likelier, or the sonar's port and "
+            "starboard are exchanged (conventions.sonar_is_mirrored: true instead): then the "
+            "map is mirrored",
+            0.5,
+            odometry="ned",
+        )
+    return "odometry"
+
+
+def _say_ned(
+    result: Examination,
+    why: str,
+    confidence: float,
+    severity: Literal["info", "warning"] = "warning",
+) -> None:
+    finding = Finding(
+        "odometry_ned",
+        "odometry",
+        f"its poses are north, east, down: {why} (conventions.odometry: ned)",
+        confidence,
+        severity,
+        result.vehicle_id,
+    )
+    result.add(finding, odometry="ned")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.doctor.examination import Examination, words_of
 from uw_dslam_ros2.core.doctor.judging.imu import ImuState, compare_yaw_and_rate
+from uw_dslam_ros2.core.doctor.judging.odometry import OdometrySample, say_mirrored
 from uw_dslam_ros2.core.doctor.motions.delays import late_in_words
 from uw_dslam_ros2.core.doctor.motions.fits import SURE
 from uw_dslam_ros2.core.doctor.samples.sample import NavigationSample
@@ -22,7 +23,7 @@ from uw_dslam_ros2.core.doctor.turning.turns import (
     choose_windows,
 )
 
-__all__ = ["choose_spans", "examine_turning"]
+__all__ = ["choose_spans", "examine_turning", "examine_turning_by_odometry"]
 
 FloatArray = NDArray[np.float64]
 
@@ -58,6 +59,23 @@ def examine_turning(
     result.num_turning_windows = trial.num_windows
     if trial.num_windows:
         _Judge(result, trial, navigation, imu).run()
+
+
+def examine_turning_by_odometry(
+    result: Examination,
+    odometry: OdometrySample,
+    beams: BeamSample,
+    spans: Sequence[tuple[float, float]],
+) -> None:
+    """Add whether turns run against the poses of a filter that is all the navigation there is."""
+    navigation = odometry.as_navigation()
+    trial = TurningTrial(beams, navigation, np.unwrap(odometry.yaw_rad), spans)
+    result.num_turning_windows = trial.num_windows
+    if not trial.num_windows or result.conventions.odometry == "ned":
+        return
+    sure = confidence_of(trial.best(-1), trial.best(1))
+    if sure > SURE:
+        say_mirrored(result, odometry, sure)
 
 
 def choose_spans(navigation: NavigationSample, ping_s: FloatArray) -> list[tuple[float, float]]:
