@@ -75,3 +75,13 @@ def test_what_is_seen_twice_is_not_twice_as_sure():
     thrice = [replace(fit, cost=np.repeat(fit.cost, 3), repeats=3.0) for fit in once]
     assert confidence_of(*thrice) == pytest.approx(confidence_of(*once))
     assert confidence_of(*reversed(once)) < 0.5 < confidence_of(*once)
+
+
+def test_the_best_of_many_needs_a_larger_lead():
+    better, worse = (TurnFit(1, 0.0, np.full(9, cost)) for cost in (1.0, 1.5))
+
+    def odds(num_tried):
+        sure = confidence_of(better, worse, num_tried)
+        return sure / (1.0 - sure)
+
+    assert odds(4) == pytest.approx(odds(1) / 4.0)

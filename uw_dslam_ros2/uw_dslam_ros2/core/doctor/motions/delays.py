@@ -15,6 +15,8 @@ _MAX_DELAY_S = 2.3
 _COARSE_S, _FINE_S = 0.1, 0.02
 _MIN_TURN_DELAY_S = 0.08
 _MIN_WAY_DELAY_S = 0.2  # a DVL's own filter takes up to that, and it costs a map nothing
+_NUM_WAY_DELAYS = 4
+"""Of those that are tried, as many as do not look alike: a vehicle's speed changes in a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,7 @@ def find_delays(
         moved, moved_s = _best(way)
         if moved is None or abs(moved_s) < _MIN_WAY_DELAY_S:
             return Delays()
-        by_way = confidence_of(moved, together)
+        by_way = confidence_of(moved, together, _NUM_WAY_DELAYS)
         return Delays(velocity_s=moved_s, confidence=by_way) if by_way > likely else Delays()
     # The sonar and the IMU differ: the DVL goes with one of them.
     with_sonar = way(against_imu_s)

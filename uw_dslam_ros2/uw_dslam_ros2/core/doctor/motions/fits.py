@@ -298,16 +298,20 @@ def _solve(
     ]
 
 
-def confidence_of[FitT: (TurnFit, VelocityFit)](better: FitT, worse: FitT) -> float:
+def confidence_of[FitT: (TurnFit, VelocityFit)](
+    better: FitT, worse: FitT, num_tried: int = 1
+) -> float:
     """How sure it is that the lower costs (M,) are no chance, 0.5 to 1.
 
     A cost is a negative log-likelihood; neighbouring motions err together, so two count as one,
-    and those of the same moment as half of one.
+    and those of the same moment as half of one. Of `num_tried` that had the same chance to be the
+    better one, below 0.5 too.
     """
     both = np.isfinite(better.cost) & np.isfinite(worse.cost)
-    return confidence_of_lead(float((worse.cost[both] - better.cost[both]).sum()), better.repeats)
+    lead = float((worse.cost[both] - better.cost[both]).sum())
+    return confidence_of_lead(lead, better.repeats, num_tried)
 
 
-def confidence_of_lead(lead: float, repeats: float) -> float:
+def confidence_of_lead(lead: float, repeats: float, num_tried: int = 1) -> float:
     """How sure a total cost is lower by `lead` not by chance, see `confidence_of`."""
-    return float(scipy.special.expit(lead / (2.0 * repeats)))
+    return float(scipy.special.expit(lead / (2.0 * repeats) - math.log(num_tried)))
