@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import dataclasses
-import gc
 import math
 import os
 import shutil
@@ -17,11 +16,6 @@ from uw_dslam_ros2.view import registering
 from uw_dslam_ros2.view.queue_source import QueueSource
 from uw_dslam_ros2.view.server import ViewServer
 
-# A connection that asyncio forgot (see `served`) is closed by nobody.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:Exception ignored in. <(function _SelectorTransport|socket)"
-    ":pytest.PytestUnraisableExceptionWarning"
-)
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 HOSTILE = "<b>auv_4</b><img src=x onerror=alert(1)>"
 MISSING = (
@@ -73,7 +67,6 @@ def served(source):
         loop.call_soon_threadsafe(loop.stop)
         thread.join(10)
         loop.close()
-        gc.collect()  # what was forgotten is told of here, and not in somebody else's test
 
 
 @pytest.fixture(scope="module")
