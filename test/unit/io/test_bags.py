@@ -356,16 +356,22 @@ def test_what_a_stopped_driver_repeats_under_new_stamps_is_left_out_and_told(tmp
     assert [finding.kind for finding in reader.findings] == ["sonar_frozen", "dvl_frozen"]
 
 
-def test_images_that_a_viewer_repeats_at_its_own_rate_are_left_out_untold(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
+def recording_of_images(path, images):
+    with BagWriter(path) as writer:
         messages = MessageFactory(writer.typestore)
         writer.add_topic("/auv_1/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
-        for k in range(60):
-            stamp_ns = SECOND + k * SECOND // 5
-            image = sonar_image(stamp_ns, np.uint16, 50, 40)
-            image.intensity[0, 0] = k // 3
-            writer.write("/auv_1/sonar", stamp_ns, messages.sonar_image("auv_1/sonar", image))
-    (recording,) = recordings_of([tmp_path / "bag"])
+        for image in images:
+            content = messages.sonar_image("auv_1/sonar", image)
+            writer.write("/auv_1/sonar", image.stamp_ns, content)
+    (recording,) = recordings_of([path])
+    return recording
+
+
+def test_images_that_a_viewer_repeats_at_its_own_rate_are_left_out_untold(tmp_path):
+    images = [sonar_image(SECOND + k * SECOND // 5, np.uint16, 50, 40) for k in range(60)]
+    for k, image in enumerate(images):
+        image.intensity[0, 0] = k // 3
+    recording = recording_of_images(tmp_path / "bag", images)
     with VehicleReader(recording) as reader:
         images = [e.image.intensity[0, 0] for e in reader.events() if isinstance(e, ImageEvent)]
     assert images == list(range(20))
@@ -373,18 +379,13 @@ def test_images_that_a_viewer_repeats_at_its_own_rate_are_left_out_untold(tmp_pa
 
 
 def test_white_images_are_told_and_not_taken_for_those_of_a_stopped_driver(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
-        messages = MessageFactory(writer.typestore)
-        writer.add_topic("/auv_1/sonar", "marine_acoustic_msgs/msg/ProjectedSonarImage")
-        for k in range(100):
-            stamp_ns = SECOND + k * SECOND // 2
-            image = sonar_image(stamp_ns, np.uint8, 50, 40)
-            image.intensity[:] = np.random.default_rng(k).integers(0, 200, (50, 40))
-            if k > 60:
-                image.intensity[5:] = 255
-                image.intensity[:5] = 0
-            writer.write("/auv_1/sonar", stamp_ns, messages.sonar_image("auv_1/sonar", image))
-    (recording,) = recordings_of([tmp_path / "bag"])
+    images = [sonar_image(SECOND + k * SECOND // 2, np.uint8, 50, 40) for k in range(100)]
+    for k, image in enumerate(images):
+        image.intensity[:] = np.random.default_rng(k).integers(0, 200, (50, 40))
+        if k > 60:
+            image.intensity[5:] = 255
+            image.intensity[:5] = 0
+    recording = recording_of_images(tmp_path / "bag", images)
     with VehicleReader(recording) as reader:
         assert len([e for e in reader.events() if isinstance(e, ImageEvent)]) == 100
     (finding,) = reader.findings
