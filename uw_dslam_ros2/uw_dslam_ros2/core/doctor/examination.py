@@ -67,6 +67,10 @@ class Examination:
         """Name a cause of this vehicle; see `Finding` and `add`."""
         self.add(Finding(kind, role, detail, confidence, vehicle_id=self.vehicle_id), **changes)
 
+    def put_first(self) -> None:
+        """Name what was told last before all others, which may follow from it."""
+        self.findings.insert(0, self.findings.pop())
+
 
 def words_of(changes: Mapping[str, str | float | bool]) -> str:
     """Conventions as lines of settings, for a sentence."""

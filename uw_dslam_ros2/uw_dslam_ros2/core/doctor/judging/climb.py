@@ -31,7 +31,7 @@ class Climb:
             self._frame_id = frame_id
 
     def tell(self, result: Examination) -> None:
-        """Say so, before what follows from it."""
+        """Say so, where that is so."""
         if self._num < _MIN_VELOCITIES or self._upward_m_s < self._level_m_s:
             return
         result.tell(
@@ -40,4 +40,4 @@ class Climb:
             f"in its frame {self._frame_id!r}, as transforms mount it, the vehicle moves up and "
             "down more than ahead: the frame is another instrument's, or tf turns it wrongly",
         )
-        result.findings.insert(0, result.findings.pop())
+        result.put_first()

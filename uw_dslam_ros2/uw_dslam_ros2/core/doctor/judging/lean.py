@@ -102,7 +102,7 @@ class Lean:
             f"by its orientation the vehicle leans by {lean:.0f} degrees {why} ({mend})",
             **changes,
         )
-        result.findings.insert(0, result.findings.pop())  # others may follow from it
+        result.put_first()
 
 
 def _upright(up: FloatArray) -> dict[str, Any]:
