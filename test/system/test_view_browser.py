@@ -39,12 +39,6 @@ def browser():
         made.close()
 
 
-async def _some_turns():
-    """Let the loop do what waits for it."""
-    for _ in range(20):
-        await asyncio.sleep(0)
-
-
 @contextlib.contextmanager
 def served(source):
     """The address of a view, served from a thread."""
@@ -59,11 +53,7 @@ def served(source):
     try:
         yield run(server.start())
     finally:
-        # Python 3.12 forgets connections that it has accepted when their server closes before it
-        # has made something of them (cpython issue 109564): pages are gone, so none come any more.
-        run(_some_turns())
         run(server.stop())
-        run(_some_turns())
         loop.call_soon_threadsafe(loop.stop)
         thread.join(10)
         loop.close()

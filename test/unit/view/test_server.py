@@ -1,10 +1,15 @@
 """The server of the view, asked as a browser asks it, and as others should not."""
 
 import asyncio
+import contextlib
 import dataclasses
+import gc
 import io
 import itertools
 import json
+import socket
+import time
+import warnings
 import zipfile
 
 import aiohttp
@@ -195,3 +200,52 @@ def test_a_port_that_is_taken_is_told(source):
 
     with pytest.raises(InvalidInputError, match=r"cannot listen on .* port"):
         asyncio.run(run())
+
+
+def left_open(run):
+    """What Python says of connections that nobody closed, once this has run."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", ResourceWarning)
+        asyncio.run(run())
+        gc.collect()
+    return [str(warning.message) for warning in told]
+
+
+async def connect(server):
+    """A connection to a view that has just started, which says nothing yet."""
+    address = (await server.start()).rsplit(":", 1)[1].strip("/")
+    return socket.create_connection(("127.0.0.1", int(address)))
+
+
+@pytest.mark.parametrize("num_turns", range(6))
+def test_a_page_that_comes_while_the_view_closes_is_not_left_open(source, num_turns):
+    async def run():
+        server = ViewServer(source)
+        with await connect(server):
+            for _ in range(num_turns):
+                await asyncio.sleep(0)
+            await server.stop()
+
+    assert left_open(run) == []
+
+
+def test_a_page_that_reads_nothing_is_not_left_open(source):
+    pages = []
+
+    async def run():
+        server = ViewServer(source)
+        pages.append(await connect(server))
+        pages[0].setblocking(False)
+        end_s = time.monotonic() + 20.0
+        while not any(
+            connection.transport.get_write_buffer_size()
+            for connection in server._runner.server.connections
+        ):
+            assert time.monotonic() < end_s
+            with contextlib.suppress(BlockingIOError):
+                pages[0].send(b"GET /static/map.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            await asyncio.sleep(0)
+        await server.stop()
+
+    assert left_open(run) == []
+    pages[0].close()

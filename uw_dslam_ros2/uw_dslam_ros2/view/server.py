@@ -35,6 +35,9 @@ _MAX_BODY_BYTES = 10_000
 _SHARE = 0.2
 """Of a core, that pages which follow changes may cost: they are told of them less often."""
 
+_TURNS = 4
+"""Of the loop: one makes the connection's transport, the next tells its handler; twice as many."""
+
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -62,6 +65,7 @@ class ViewServer:
         )
         self._changed = asyncio.Condition()
         self._runner: web.AppRunner | None = None
+        self._listening: asyncio.Server | None = None
         self._pairs: dict[tuple[str, int, int | None], Pair] = {}
         self._is_closing = False
         self._telling: asyncio.Task[None] | None = None
@@ -92,16 +96,18 @@ class ViewServer:
         self._source.listen(lambda: _call_in(loop, self.notify))
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await self._runner.setup()
-        site = web.TCPSite(self._runner, self._address, self._port)
+        assert self._runner.server is not None
         try:
-            await site.start()
+            self._listening = await loop.create_server(
+                self._runner.server, self._address, self._port
+            )
         except OSError as error:
             raise InvalidInputError(
                 f"cannot listen on {self._address} port {self._port}: {error.strerror}"
             ) from error
         # Drawn while the first page comes.
         self._map.submit(lambda: self._source.showing().tile(None, 0, 0, 0))
-        port = self._runner.addresses[0][1]
+        port = self._listening.sockets[0].getsockname()[1]
         host = f"[{self._address}]" if ":" in self._address else self._address
         query = f"/?token={self._guard.token}" if self._guard.token else "/"
         return f"http://{host}:{port}{query}"
@@ -128,8 +134,16 @@ class ViewServer:
             self._telling.cancel()
         async with self._changed:
             self._changed.notify_all()
-        if self._runner is not None:
+        if self._listening is not None:
+            await _stop_listening(self._listening)
+        if self._runner is not None and self._runner.server is not None:
+            transports = [page.transport for page in self._runner.server.connections]
             await self._runner.cleanup()
+            for transport in transports:
+                if transport is not None:
+                    # What a page did not read would keep it open.
+                    transport.abort()
+            await asyncio.sleep(0)
         for pool in (self._map, self._looks, self._small):
             pool.shutdown(wait=False, cancel_futures=True)
 
@@ -325,6 +339,21 @@ class ViewServer:
                 self._pace.spend(time.thread_time() - begun_s)
 
         return await asyncio.get_running_loop().run_in_executor(pool or self._map, timed)
+
+
+async def _stop_listening(server: asyncio.Server) -> None:
+    """Close, and leave no connection half made.
+
+    What Python 3.12 accepts it makes a connection of some turns of the loop later, and fails to,
+    leaving it open, if the server is closed by then (cpython issue 109564). So first nothing more
+    is accepted, then what was is made a connection, which the runner knows and closes.
+    """
+    loop = asyncio.get_running_loop()
+    for listening in server.sockets:
+        loop.remove_reader(listening.fileno())
+    for _ in range(_TURNS):
+        await asyncio.sleep(0)
+    server.close()
 
 
 def _call_in(
