@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.registration.grids import register
 from uw_dslam_ros2.core.registration.grids.config import GridRegistrationConfig
 from uw_dslam_ros2.core.registration.grids.finding import candidates
 from uw_dslam_ros2.core.registration.grids.finding.candidates import log_volume, scan_candidates
@@ -48,7 +49,9 @@ def test_the_true_pose_is_a_candidate_among_thin_walls(thin_walled):
     assert any(is_right(pair, T) for T in T_found)
 
 
-def test_evidence_finds_the_true_pose_among_thin_walls():
+def test_evidence_finds_the_true_pose_among_thin_walls(monkeypatch):
+    # Mirrors and symmetries take two thirds of the time, and move no pose.
+    monkeypatch.setattr(register, "_LOOK_FOR_DOUBTS", 2.0)
     found = []
     for seed in range(1, 5):
         pair = _thin_walled_pair(seed)
