@@ -151,3 +151,28 @@ def test_same_input_same_bytes():
 def test_a_field_of_nothing_is_refused():
     with pytest.raises(InvalidInputError, match="needs points"):
         LikelihoodField(np.empty((0, 2)), np.empty(0), 0.1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_derivatives_are_those_of_differences_taken_one_by_one(seed):
+    rng = np.random.default_rng(seed)
+    field = LikelihoodField(corner(), np.ones(len(corner())), 2.0 * SIGMA)
+    points, weight = corner()[:: 1 + seed], rng.random(len(corner()[:: 1 + seed]))
+    pose, steps = rng.normal(0.0, (0.2, 0.2, 0.03)), np.array([SIGMA, SIGMA, SIGMA / 3.0])
+    units = np.diag(steps)
+
+    def score(offset):
+        return field.scores(points, weight, (pose + offset)[None])[0]
+
+    gradient, hessian = field.derivatives(points, weight, pose, steps)
+    for i in range(3):
+        slope = (score(units[i]) - score(-units[i])) / (2.0 * steps[i])
+        second = (score(units[i]) + score(-units[i]) - 2.0 * score(np.zeros(3))) / steps[i] ** 2
+        assert gradient[i] == pytest.approx(slope, abs=1e-9)
+        assert hessian[i, i] == pytest.approx(second, abs=1e-9)
+        for j in range(i):
+            both, apart = units[i] + units[j], units[i] - units[j]
+            mixed = score(both) + score(-both) - score(apart) - score(-apart)
+            mixed /= 4.0 * steps[i] * steps[j]
+            assert hessian[i, j] == hessian[j, i] == pytest.approx(mixed, abs=1e-9)
+    assert np.abs(gradient).max() > 1.0

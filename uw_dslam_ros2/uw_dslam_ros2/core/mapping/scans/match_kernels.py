@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["score_poses", "score_window", "splat"]
+__all__ = ["derivatives", "score_poses", "score_window", "splat"]
 
 
 @njit(cache=True, nogil=True)
@@ -93,3 +93,33 @@ def score_window(  # type: ignore[no-untyped-def]
                     if 0 <= col < num_cols:
                         scores[t, m, n] += weight[i] * field[row, col]
     return scores
+
+
+@njit(cache=True, nogil=True)
+def derivatives(field, origin_x, origin_y, cell, points, weight, pose, steps):  # type: ignore[no-untyped-def]
+    """Gradient (3,) and Hessian (3, 3) of the score at a pose (3,), by central differences.
+
+    `steps` (3,) [m, m, rad] smooth the jumps between cells.
+    """
+    poses = np.empty((19, 3))
+    poses[:] = pose
+    row = 7
+    for i in range(3):
+        poses[1 + 2 * i, i] += steps[i]
+        poses[2 + 2 * i, i] -= steps[i]
+        for j in range(i + 1, 3):
+            for k, (first, second) in enumerate(((1, 1), (-1, -1), (1, -1), (-1, 1))):
+                poses[row + k, i] += first * steps[i]
+                poses[row + k, j] += second * steps[j]
+            row += 4
+    s = score_poses(field, origin_x, origin_y, cell, points, weight, poses)
+    gradient, hessian = np.empty(3), np.empty((3, 3))
+    row = 7
+    for i in range(3):
+        gradient[i] = (s[1 + 2 * i] - s[2 + 2 * i]) / 2.0 / steps[i]
+        hessian[i, i] = (s[1 + 2 * i] + s[2 + 2 * i] - 2.0 * s[0]) / steps[i] ** 2
+        for j in range(i + 1, 3):
+            mixed = s[row] + s[row + 1] - s[row + 2] - s[row + 3]
+            hessian[i, j] = hessian[j, i] = mixed / (4.0 * steps[i] * steps[j])
+            row += 4
+    return gradient, hessian

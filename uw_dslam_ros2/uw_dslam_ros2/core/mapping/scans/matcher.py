@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.mapping.scans.match_kernels import score_poses, score_window, splat
+from uw_dslam_ros2.core.mapping.scans.match_kernels import (
+    derivatives,
+    score_poses,
+    score_window,
+    splat,
+)
 from uw_dslam_ros2.core.se2 import SE2, wrap_angle
 
 __all__ = ["LikelihoodField", "Prior", "ScanMatch", "match_points", "thin"]
@@ -92,6 +97,15 @@ class LikelihoodField:
     def scores(self, points: FloatArray, weight: FloatArray, poses: FloatArray) -> FloatArray:
         """Sums of weighted values under points (N, 2) at each pose (K, 3)."""
         return score_poses(self.values, *self.origin, self.cell_m, points, weight, poses)
+
+    def derivatives(
+        self, points: FloatArray, weight: FloatArray, pose: FloatArray, steps: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Gradient (3,) and Hessian (3, 3) of the score at a pose, by differences over `steps`."""
+        found: tuple[FloatArray, FloatArray] = derivatives(
+            self.values, *self.origin, self.cell_m, points, weight, pose, steps
+        )
+        return found
 
     def values_at(self, points: FloatArray) -> FloatArray:
         """Values (N,) of the cells that hold points (N, 2); 0 outside."""
@@ -250,49 +264,6 @@ def _search(
     return starts
 
 
-def _derivatives(
-    field: LikelihoodField,
-    source: FloatArray,
-    weight: FloatArray,
-    pose: FloatArray,
-    h_m: float,
-    scale: float,
-) -> tuple[float, FloatArray, FloatArray]:
-    """Score, gradient (3,) and Hessian (3, 3) by central differences.
-
-    The step `h_m` smooths the jumps between cells.
-    """
-    steps = np.array([h_m, h_m, h_m / scale])
-    offsets = [np.zeros(3)]
-    for i in range(3):
-        offsets += [_unit(i), -_unit(i)]
-    pairs = [(0, 1), (0, 2), (1, 2)]
-    for i, j in pairs:
-        offsets += [
-            _unit(i) + _unit(j),
-            -_unit(i) - _unit(j),
-            _unit(i) - _unit(j),
-            _unit(j) - _unit(i),
-        ]
-    s = field.scores(source, weight, pose + np.array(offsets) * steps)
-    gradient = np.array([(s[1 + 2 * i] - s[2 + 2 * i]) / 2.0 for i in range(3)]) / steps
-    hessian = np.zeros((3, 3))
-    for i in range(3):
-        hessian[i, i] = (s[1 + 2 * i] + s[2 + 2 * i] - 2.0 * s[0]) / steps[i] ** 2
-    for k, (i, j) in enumerate(pairs):
-        plus, minus, mixed, dexim = s[7 + 4 * k : 11 + 4 * k]
-        hessian[i, j] = hessian[j, i] = (plus + minus - mixed - dexim) / (
-            4.0 * steps[i] * steps[j]
-        )
-    return float(s[0]), gradient, hessian
-
-
-def _unit(i: int) -> FloatArray:
-    unit = np.zeros(3)
-    unit[i] = 1.0
-    return unit
-
-
 def _polish(
     field: LikelihoodField,
     source: FloatArray,
@@ -309,17 +280,16 @@ def _polish(
     derivatives are smooth over a sigma: interpolation between cells has its peaks at cells.
     """
     size = np.array([1.0, 1.0, scale])
+    units, steps = np.outer(size, size), field.sigma_m / size
     start = pose
     known = np.zeros((3, 3))
     for _ in range(4):
-        _, gradient, hessian = _derivatives(field, source, weight, pose, field.sigma_m, scale)
-        values, vectors = np.linalg.eigh(-share * hessian / np.outer(size, size))
-        prior_values = np.einsum(
-            "ik,ij,jk->k", vectors, prior_information / np.outer(size, size), vectors
-        )
+        gradient, hessian = field.derivatives(source, weight, pose, steps)
+        values, vectors = np.linalg.eigh(-share * hessian / units)
+        prior_values = np.einsum("ik,ij,jk->k", vectors, prior_information / units, vectors)
         chosen = values > np.maximum(prior_values, 1e-9)
         basis = vectors[:, chosen]
-        known = (basis * values[chosen]) @ basis.T * np.outer(size, size)
+        known = (basis * values[chosen]) @ basis.T * units
         step = basis @ ((basis.T @ (share * gradient / size)) / values[chosen]) / size
         if np.abs((pose + step - start) * size).max() > 2.0 * field.sigma_m:
             break
@@ -340,21 +310,20 @@ def _climb(
     """Damped Newton ascent of share * score + log prior."""
     damping = 1e-3
     size = np.array([1.0, 1.0, scale])
+    units, steps = np.outer(size, size), 0.5 * field.sigma_m / size
     best = share * float(field.scores(source, weight, pose[None])[0])
     delta = _difference(pose, mean)
     best -= 0.5 * float(delta @ prior_information @ delta)
     for _ in range(_MAX_STEPS):
-        _, gradient, hessian = _derivatives(
-            field, source, weight, pose, 0.5 * field.sigma_m, scale
-        )
-        values, vectors = np.linalg.eigh(-share * hessian / np.outer(size, size))
-        curvature = (vectors * np.abs(values)) @ vectors.T * np.outer(
-            size, size
-        ) + prior_information
+        gradient, hessian = field.derivatives(source, weight, pose, steps)
+        values, vectors = np.linalg.eigh(-share * hessian / units)
+        curvature = (vectors * np.abs(values)) @ vectors.T * units + prior_information
+        damped, diagonal = curvature.copy(), np.diag(curvature)
         slope = share * gradient - prior_information @ _difference(pose, mean)
         moved = False
         for _ in range(5):
-            step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), slope)
+            np.fill_diagonal(damped, diagonal + damping * diagonal)
+            step = np.linalg.solve(damped, slope)
             trial = pose + step
             delta = _difference(trial, mean)
             value = share * float(field.scores(source, weight, trial[None])[0])
