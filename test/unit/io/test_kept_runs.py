@@ -6,11 +6,13 @@ from contextlib import closing
 import numpy as np
 import pytest
 from unit.chart.test_redraw import _CONFIG, mapped
+from unit.mapping.test_resuming import drive
 
-from uw_dslam_ros2.core.chart.pings import DrawnPing
+from uw_dslam_ros2.core.chart.pings import DrawnPing, KeptPings
 from uw_dslam_ros2.core.chart.redraw import redrawn
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
+from uw_dslam_ros2.core.mapping import VehicleMapper
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
 from uw_dslam_ros2.io.sessions import kept_runs
@@ -164,3 +166,101 @@ def test_what_is_forgotten_is_gone(run, tmp_path):
     assert list(tmp_path.glob("run_*")) == []
     assert later.earlier == []
     later.close()
+
+
+SETUP = b"settings of one!"
+
+
+def killed_in(folder, num_pings=70):
+    """A mapper whose process was killed after a ping, with all that it kept on the way."""
+    pings = KeptPings()
+    mapper, kept = VehicleMapper(_CONFIG, "auv_1", RUN_ID, pings), KeptRuns(folder)
+    for i in range(num_pings):
+        kept.save(drive(mapper, [i]), pings.of_submap)
+        if i % 7 == 6:
+            kept.save_open(mapper, pings.of_submap, SETUP)
+    kept.close()
+    return mapper, pings
+
+
+def test_a_run_is_gone_on_with_where_it_was_kept_last(tmp_path):
+    mapper, pings = killed_in(tmp_path)
+    with closing(KeptRuns(tmp_path)) as later:
+        run = later.resume("auv_1", SETUP)
+        assert len(later.earlier) == 1
+        later.take(run)
+        assert later.earlier == []
+    state, expected = run.state, mapper.state()
+    assert (state.run_id, state.sequence) == (RUN_ID, expected.sequence)
+    assert state.sequence > 0
+    for name in ("trajectory", "stamps_ns", "weight", "points"):
+        np.testing.assert_array_equal(
+            getattr(state.section, name), getattr(expected.section, name)
+        )
+    np.testing.assert_array_equal(state.navigation.mean, expected.navigation.mean)
+    np.testing.assert_array_equal(
+        state.dead_reckoning.covariance, expected.dead_reckoning.covariance
+    )
+    for submap_id, own in pings.of_submap.items():
+        for one, other in zip(run.pings[submap_id], own, strict=True):
+            assert_equal(one, other)
+    # What is in a submap weighs as much as its echoes did.
+    (first, weight), section = run.held.closed[0], mapper._submaps.closed[0]
+    assert_equal(first, mapper.submaps()[0])
+    np.testing.assert_allclose(weight.sum(), section.weight.sum(), rtol=0.01)
+
+    again = VehicleMapper(_CONFIG, "auv_1", RUN_ID)
+    again.resume(run.state, run.held)
+    drive(again, range(70, 160))
+    again.finish()
+    assert len(again.trajectory()[0]) == 160
+
+
+def test_what_closed_after_it_was_kept_last_is_not_mapped_twice(tmp_path):
+    mapper, pings = killed_in(tmp_path)
+    kept = KeptRuns(tmp_path)
+    kept.take(kept.resume("auv_1", SETUP))
+    kept.save(mapper.finish(), pings.of_submap)  # told to end, it gave its open submap away
+    kept.close()
+    with closing(KeptRuns(tmp_path)) as later:
+        run = later.resume("auv_1", SETUP)
+    again = VehicleMapper(_CONFIG, "auv_1", RUN_ID)
+    again.resume(run.state, run.held)
+    assert len(again.submaps()) == len(mapper.submaps())
+    issued = drive(again, range(70, 160)) + again.finish()
+    assert min(s.sequence for s in issued) == len(mapper.submaps())
+    assert len(again.trajectory()[0]) == again.num_pings == 160
+
+
+def test_a_file_that_is_cut_off_loses_its_last_second(tmp_path):
+    killed_in(tmp_path)
+    path = tmp_path / "open_submap"
+    path.write_bytes(path.read_bytes()[:-1])
+    with closing(KeptRuns(tmp_path)) as later:
+        run = later.resume("auv_1", SETUP)
+    assert run.state.last_ping_ns == (70 - 7 - 1) * 500_000_000
+    assert run.held.num_pings(run.state) == 63
+
+
+def test_with_other_settings_no_run_is_gone_on_with(tmp_path):
+    killed_in(tmp_path)
+    with closing(KeptRuns(tmp_path)) as later:
+        assert later.resume("auv_1", b"settings of two!") is None
+        assert len(later.earlier) == 1  # it is drawn anew as before
+
+
+def test_a_run_that_lacks_a_submap_is_not_gone_on_with(tmp_path):
+    killed_in(tmp_path)
+    (path,) = tmp_path.glob("run_*.sqlite")
+    path.unlink()
+    with closing(KeptRuns(tmp_path)) as later, pytest.raises(DataError, match="holds 0 submaps"):
+        later.resume("auv_1", SETUP)
+
+
+def test_where_pings_are_left_out_no_run_is_gone_on_with(tmp_path):
+    pings = KeptPings(max_bytes=1.0)
+    mapper, kept = VehicleMapper(_CONFIG, "auv_1", RUN_ID, pings), KeptRuns(tmp_path)
+    drive(mapper, range(5))
+    kept.save_open(mapper, pings.of_submap, SETUP)
+    assert kept.resume("auv_1", SETUP) is None
+    kept.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,6 +99,14 @@ class KeptPings:
         self.num_bytes = self.num_left_out = 0
         self._max_bytes = max_bytes
         self._last: DrawnPing | None = None
+
+    def take(self, pings: Mapping[SubmapId, Sequence[DrawnPing]]) -> None:
+        """Keep what another has kept."""
+        for submap_id, own in pings.items():
+            self.of_submap[submap_id] = list(own)
+            for ping in own:
+                last, self._last = self._last, ping
+                self.num_bytes += ping.num_bytes_after(last)
 
     def __call__(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.mapper_state import HeldSubmaps, MapperState
 from uw_dslam_ros2.core.mapping.vehicle_mapper import MapperWatch, VehicleMapper
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap
@@ -123,6 +124,12 @@ class VehicleRuns:
         self.breaks.append(reason)
         self.mapper = self._new_mapper()
         return issued
+
+    def resume(self, state: MapperState, held: HeldSubmaps) -> None:
+        """Go on with a run of an earlier process, before anything has come; see the mapper."""
+        mapper = VehicleMapper(self._config, self._vehicle_id, state.run_id, self._watch)
+        mapper.resume(state, held)
+        self.mapper = mapper
 
     def issued(self, run_id: int, sequence: int) -> Submap | None:
         """A submap of any run as it was given away last; 0: of the run that goes on."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.mapping.config import SubmapConfig, VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.drawing.log_odds_grid import CompressedGrid
 from uw_dslam_ros2.core.mapping.drawing.occupancy import GrowingGrid
+from uw_dslam_ros2.core.mapping.mapper_state import SectionState
 from uw_dslam_ros2.core.mapping.scans.local_map import joined
 from uw_dslam_ros2.core.mapping.scans.matcher import thin
 from uw_dslam_ros2.core.se2 import SE2
@@ -64,6 +65,23 @@ class ClosedSection:
             return 0.0
         return float(np.quantile(np.linalg.norm(self.points - self.center, axis=1), 0.9))
 
+    @classmethod
+    def of(cls, submap: Submap, weight: FloatArray, drift: FloatArray) -> ClosedSection:
+        """What `to_submap` gave, to the percent; with what it does not give."""
+        return cls(
+            submap.sequence,
+            submap.stamp_ns,
+            CompressedGrid.of(submap.grid),
+            submap.points,
+            weight,
+            submap.trajectory,
+            submap.trajectory_stamp_ns,
+            submap.covariance,
+            drift,
+            submap.T_odom_submap,
+            submap.revision,
+        )
+
     def replace(self, submap: Submap) -> None:
         """Be a later revision of what `to_submap` gave; points for matching stay as they are."""
         self.grid = CompressedGrid.of(submap.grid)
@@ -112,6 +130,37 @@ class OpenSection:
         self._last_mapped: tuple[int, SE2] | None = None
         self.num_pings = 0
         self._watch = watch
+
+    def resume(self, held: SectionState, drawn: Iterable[tuple[Detections, SE2]]) -> None:
+        """Hold what another has held; ``drawn`` is what entered its grid, and from where."""
+        self._points, self._weight = [held.points], [held.weight]
+        self._trajectory = [(x, y, yaw) for x, y, yaw in held.trajectory.tolist()]
+        self._stamps_ns = held.stamps_ns.tolist()
+        self._length_m = float(np.hypot(*np.diff(held.trajectory[:, :2], axis=0).T).sum())
+        self.num_pings = held.num_pings
+        for detections, T_submap_sonar in drawn:
+            self.grid.add(detections, T_submap_sonar)
+
+    def state(self, num_poses: int = 0, num_echoes: int = 0) -> SectionState:
+        """What has come after so many poses, and pings with echoes; by default all."""
+        return SectionState(
+            self.num_pings,
+            self.grid.num_pings,
+            np.array(self._trajectory[num_poses:]).reshape(-1, 3),
+            np.array(self._stamps_ns[num_poses:], dtype=np.int64),
+            np.vstack([np.empty((0, 2)), *self._points[num_echoes:]]),
+            np.concatenate([np.empty(0), *self._weight[num_echoes:]]),
+        )
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (3, 3) of its pose, relative to the submap before."""
+        return self._covariance
+
+    @property
+    def num_echoes(self) -> int:
+        """Pings whose echoes are kept for matching."""
+        return len(self._points)
 
     @property
     def poses(self) -> FloatArray:

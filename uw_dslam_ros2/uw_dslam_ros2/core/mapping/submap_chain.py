@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
 from uw_dslam_ros2.core.mapping.loops.estimators import make_estimator
+from uw_dslam_ros2.core.mapping.mapper_state import HeldSubmaps, MapperState
 from uw_dslam_ros2.core.mapping.section import ClosedSection, OpenSection
 from uw_dslam_ros2.core.mapping.vehicle_map import VehicleMap, path_of
 from uw_dslam_ros2.core.pose_graph import chained_covariance
@@ -70,6 +71,27 @@ class SubmapChain:
         """Open the next submap; covariance (3, 3) in the previous submap's frame."""
         self.estimator.add_next(T_previous_new, covariance)
         self._open(covariance)
+
+    def resume(self, state: MapperState, held: HeldSubmaps, drift: FloatArray) -> None:
+        """Hold what another has held; `drift` (3, 3) is that of the open submap by now.
+
+        What its loops said stays in the poses; the graph knows the odometry that follows from
+        them.
+        """
+        poses = [SE2.from_array(pose) for pose in state.T_odom_submap]
+        steps = [submap.covariance for submap, _ in held.closed[: state.sequence]]
+        steps.append(state.covariance)
+        self.estimator.add_first(poses[0], steps[0])
+        for before, after, covariance in zip(poses, poses[1:], steps[1:], strict=False):
+            self.estimator.add_next(before.inverse() @ after, covariance)
+        self.closed = [
+            ClosedSection.of(submap, weight, step)
+            for (submap, weight), step in zip(held.closed, [*steps[1:], drift], strict=False)
+        ]
+        if len(self.closed) == state.sequence:
+            self._open(state.covariance)
+            assert self.growing is not None
+            self.growing.resume(state.section, held.drawn)
 
     def close(self, drift: FloatArray) -> list[Submap]:
         """Close the one that grows, look for loops, and say which are new or have moved.

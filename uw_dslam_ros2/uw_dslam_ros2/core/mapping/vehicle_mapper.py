@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from uw_dslam_ros2.core.errors import InvalidInputError
 from uw_dslam_ros2.core.grid import OccupancyMap
 from uw_dslam_ros2.core.mapping.config import VehicleMapperConfig
+from uw_dslam_ros2.core.mapping.mapper_state import HeldSubmaps, MapperState
 from uw_dslam_ros2.core.mapping.scans.key_pings import KeyPings
 from uw_dslam_ros2.core.mapping.submap_chain import MapperWatch, SubmapChain
 from uw_dslam_ros2.core.mapping.vehicle_navigation import VehicleNavigation
@@ -68,6 +69,7 @@ class VehicleMapper(VehicleNavigation):
         self._track, self._watch = Track(vehicle_id, run_id), watch
         self._suit(_FAN_BEAM_RAD)
         self._last_ping_ns: int | None = None
+        self._is_resumed = False
         self._counts = {
             "num_pings": 0, "num_pings_dropped": 0, "num_pings_empty": 0, "num_detections_last": 0,
         }  # fmt: skip
@@ -142,6 +144,39 @@ class VehicleMapper(VehicleNavigation):
         last_ns = int(self._submaps.growing.stamps_ns[-1])
         return issued + self._submaps.close(self._navigation.relative_at(last_ns)[1])
 
+    def state(self, num_poses: int = 0, num_echoes: int = 0) -> MapperState | None:
+        """All that is needed to go on but what was given away and drawn; None: no open submap.
+
+        Of the open submap what has come after so many poses, and pings with echoes.
+        """
+        submaps, navigation = self._submaps, self._navigation
+        if submaps.growing is None or self._last_ping_ns is None:
+            return None
+        dead = self._dead_reckoning
+        return MapperState(
+            self.run_id,
+            self._beamwidth_rad,
+            self._last_ping_ns,
+            self._velocity_ns,
+            navigation.state(),
+            None if dead is None else dead.state(),
+            np.array([pose.as_array() for pose in submaps.estimator.poses]),
+            submaps.growing.covariance,
+            submaps.growing.state(num_poses, num_echoes),
+        )
+
+    def resume(self, state: MapperState, held: HeldSubmaps) -> None:
+        """Go on from a state in the place of a start: the run goes on.
+
+        The next ping closes the submap that was open: the way that no ping has seen lies between
+        two submaps, and its covariance is that of navigation over the time without messages.
+        """
+        self._resume_navigation(state.navigation, state.dead_reckoning, state.velocity_ns)
+        self._suit(state.beamwidth_rad)
+        self._last_ping_ns, self._is_resumed = state.last_ping_ns, True
+        self._counts["num_pings"] = held.num_pings(state)
+        self._submaps.resume(state, held, self._navigation.relative_at(state.last_ping_ns)[1])
+
     def issued(self, sequence: int) -> Submap | None:
         """A submap as it was given away last; None if there is none of this number."""
         return self._submaps.issued(sequence)
@@ -165,6 +200,16 @@ class VehicleMapper(VehicleNavigation):
     def run_id(self) -> int:
         """Which run of its vehicle this is, see `core.submap.Track`."""
         return self._track.run_id
+
+    @property
+    def vehicle_id(self) -> str:
+        """Whose."""
+        return self._track.vehicle_id
+
+    @property
+    def num_echoes(self) -> int:
+        """Pings whose echoes the open submap keeps; see `state`."""
+        return 0 if self._submaps.growing is None else self._submaps.growing.num_echoes
 
     @property
     def num_pings(self) -> int:
@@ -257,6 +302,7 @@ class VehicleMapper(VehicleNavigation):
 
     def _suit(self, beamwidth_rad: float) -> None:
         """Take settings that are left to the sonar from the first that is known of it."""
+        self._beamwidth_rad = beamwidth_rad
         self._config = self._own_config.suited(beamwidth_rad)
         self._submaps = SubmapChain(self._config, self._track, self._watch)
         self._keys = KeyPings(self._config, self._navigation)
@@ -299,7 +345,9 @@ class VehicleMapper(VehicleNavigation):
         if not len(detections.points):
             self._count("num_pings_empty")
         submaps, navigation = self._submaps, self._navigation
-        if submaps.growing is None:
+        if self._is_resumed:
+            issued += self._close_resumed(stamp_ns)
+        elif submaps.growing is None:
             submaps.begin(*navigation.pose_at(stamp_ns))
             navigation.clone(stamp_ns)
         if self._keys.is_due(stamp_ns):
@@ -310,13 +358,29 @@ class VehicleMapper(VehicleNavigation):
         T_dead_base = self.dead_reckoning_at(stamp_ns)
         assert submaps.growing is not None
         if submaps.growing.should_close(stamp_ns, sigma_m, self.velocity_silence_s(stamp_ns)):
-            issued = submaps.close(covariance)
-            submaps.go_on(T_submap_base, covariance)
-            self._keys.rebase(T_submap_base.inverse())
-            navigation.clone(stamp_ns)
+            issued += submaps.close(covariance)
+            self._go_on(stamp_ns, T_submap_base, covariance)
             T_submap_base = SE2()
         if sweep is None:
             submaps.growing.add(detections, T_submap_base, T_base_sonar, T_dead_base)
         else:
             submaps.growing.add_sweep(sweep, T_submap_base, T_dead_base)
         return issued
+
+    def _close_resumed(self, stamp_ns: int) -> list[Submap]:
+        """Of a mapper that was resumed, at its first ping."""
+        self._is_resumed, submaps = False, self._submaps
+        issued: list[Submap] = []
+        if submaps.growing is not None:
+            if submaps.growing.num_pings < self._config.submap.min_pings:
+                return issued
+            last_ns = int(submaps.growing.stamps_ns[-1])
+            issued = submaps.close(self._navigation.relative_at(last_ns)[1])
+        self._go_on(stamp_ns, *self._navigation.relative_at(stamp_ns))
+        return issued
+
+    def _go_on(self, stamp_ns: int, T_submap_base: SE2, covariance: FloatArray) -> None:
+        """Open the next submap where the vehicle is in the one before."""
+        self._submaps.go_on(T_submap_base, covariance)
+        self._keys.rebase(T_submap_base.inverse())
+        self._navigation.clone(stamp_ns)

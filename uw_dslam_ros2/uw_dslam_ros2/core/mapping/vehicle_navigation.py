@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uw_dslam_ros2.core.errors import InvalidInputError
-from uw_dslam_ros2.core.navigation import NavigationConfig, NavigationFilter
+from uw_dslam_ros2.core.navigation import FilterState, NavigationConfig, NavigationFilter
 from uw_dslam_ros2.core.navigation.pose_differences import PoseDifferences
 from uw_dslam_ros2.core.se2 import SE2
 
@@ -166,6 +166,16 @@ class VehicleNavigation:
         if self._dead_reckoning is None:
             return (self._navigation,)
         return self._navigation, self._dead_reckoning
+
+    def _resume_navigation(
+        self, state: FilterState, dead_reckoning: FilterState | None, velocity_ns: int | None
+    ) -> None:
+        self._navigation.resume(state)
+        self._velocity_ns = velocity_ns
+        if self._dead_reckoning is None or dead_reckoning is None:
+            self._dead_reckoning = None
+        else:
+            self._dead_reckoning.resume(dead_reckoning)
 
     def _remember(self, span_s: float) -> None:
         """Know poses for so long; see `NavigationFilter.remember`."""

@@ -25,7 +25,7 @@ from uw_dslam_ros2.core.navigation.measurements import (
 )
 from uw_dslam_ros2.core.se2 import SE2
 
-__all__ = ["NavigationFilter"]
+__all__ = ["FilterState", "NavigationFilter"]
 
 FloatArray = NDArray[np.float64]
 # At one stamp events are applied in this order, whatever order they came in.
@@ -51,6 +51,19 @@ class _Record:
     refused_since_ns: dict[type, int]
     said: tuple[int, FloatArray] | None = None
     """When a velocity (2,) [m/s] along base_link's axes was measured last, used or not."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilterState:
+    """What a filter knows at one moment, so that another goes on from there."""
+
+    stamp_ns: int
+    mean: FloatArray
+    """(S,): pose, velocity, sensor errors, and the pose of the clone."""
+    covariance: FloatArray
+    """(S, S)."""
+    zero_rad: float | None
+    """Yaw of the odom frame's x axis, where the frame was begun before there was a yaw."""
 
 
 class NavigationFilter:
@@ -93,6 +106,24 @@ class NavigationFilter:
     def oldest_ns(self) -> int | None:
         """From when on poses are known; None before the start."""
         return self._records[0].key[0] if self._records else None
+
+    def state(self) -> FilterState:
+        """All that is known now; raises `InvalidInputError` before the start."""
+        if not self._records:
+            raise InvalidInputError("the filter has no state yet, expected measurements first")
+        newest = self._records[-1]
+        return FilterState(newest.key[0], newest.state, newest.covariance, self._zero_rad)
+
+    def resume(self, state: FilterState) -> None:
+        """Go on from a state in the place of a start; what is earlier counts as late."""
+        if state.mean.shape != (NUM_STATES,) or state.covariance.shape != (NUM_STATES,) * 2:
+            raise InvalidInputError(
+                f"the filter's state has shape {state.mean.shape}, expected ({NUM_STATES},)"
+            )
+        key = state.stamp_ns, max(_ORDER.values()), ()
+        self._records = [_Record(key, Clone(), state.mean, state.covariance, {})]
+        self._early, self._zero_rad = None, state.zero_rad
+        self._is_blind = state.zero_rad is not None
 
     def remember(self, span_s: float) -> None:
         """Know poses, and take late messages, for so long from now on; at least the horizon."""

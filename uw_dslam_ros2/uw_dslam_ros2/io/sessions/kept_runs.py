@@ -1,7 +1,7 @@
 """What a mapper has mapped, and from which pings, so that the last pass outlives the process.
 
 A file for each run, with the records of `session_file`: each submap as it was first given away,
-its pings, and its pose as it was given away last.
+its pings, and its pose as it was given away last. What is in the open submap is in `open_submap`.
 """
 
 from __future__ import annotations
@@ -10,16 +10,23 @@ import dataclasses
 import json
 import sqlite3
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
+from numpy.typing import NDArray
 
 from uw_dslam_ros2.core.chart.pings import DrawnPing
 from uw_dslam_ros2.core.errors import DataError
+from uw_dslam_ros2.core.mapping import VehicleMapper
+from uw_dslam_ros2.core.mapping.mapper_state import HeldSubmaps, MapperState
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import Submap, SubmapId
 from uw_dslam_ros2.io.sessions.array_files import arrays_from_bytes, arrays_to_bytes
 from uw_dslam_ros2.io.sessions.folder_lock import FolderLock
+from uw_dslam_ros2.io.sessions.open_submap import OpenSubmapFile
+from uw_dslam_ros2.io.sessions.ping_arrays import arrays_of_pings, pings_of_arrays
 from uw_dslam_ros2.io.sessions.session_file import (
     VERSION,
     Record,
@@ -30,14 +37,26 @@ from uw_dslam_ros2.io.sessions.session_file import (
 )
 from uw_dslam_ros2.io.sessions.session_records import submap_from_bytes, submap_to_bytes
 
-__all__ = ["KeptRun", "KeptRuns"]
+__all__ = ["KeptRun", "KeptRuns", "ResumedRun"]
 
 KeptRun = tuple[list[Submap], dict[SubmapId, list[DrawnPing]]]
 """Submaps of a run in their order, as given away last, and what is kept of their pings."""
 _MAX_BYTES = 1 << 28
 """Of one submap, and of its pings."""
-_UNKNOWN = np.full(3, np.nan)
-"""A pose."""
+_LEAST_WEIGHT = 0.1
+"""Of a point: there is one where something was heard."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResumedRun:
+    """A run to go on with."""
+
+    state: MapperState
+    held: HeldSubmaps
+    pings: dict[SubmapId, list[DrawnPing]]
+    """Of all its submaps, the open one included."""
+    records: dict[RecordName, Record]
+    """Of its file."""
 
 
 class KeptRuns:
@@ -63,6 +82,7 @@ class KeptRuns:
         self.earlier = sorted(self._folder.glob("run_*.sqlite"))
         """Files of processes before this one."""
         self._records: dict[Path, dict[RecordName, Record]] = {}
+        self._open = OpenSubmapFile(self._folder / "open_submap")
 
     def save(
         self, submaps: Sequence[Submap], pings: Mapping[SubmapId, Sequence[DrawnPing]]
@@ -84,7 +104,7 @@ class KeptRuns:
                 if ("submap", key) not in held:
                     own = pings.get(submap.submap_id, ())
                     new["submap", key] = Record.of(submap_to_bytes(submap))
-                    new["pings", key] = Record.of(_pings_to_bytes(own))
+                    new["pings", key] = Record.of(arrays_to_bytes(arrays_of_pings(own)))
                 place = submap.T_odom_submap.as_array().tolist()
                 new["pose", key] = Record.of(json.dumps([submap.revision, place]).encode())
             try:
@@ -94,6 +114,67 @@ class KeptRuns:
             # What is written is not needed in memory any more.
             held.update((name, Record(record.digest, _lost)) for name, record in new.items())
 
+    def save_open(
+        self, mapper: VehicleMapper, pings: Mapping[SubmapId, Sequence[DrawnPing]], setup: bytes
+    ) -> None:
+        """Keep what is in the open submap by now, and what is needed to go on from there.
+
+        Parameters
+        ----------
+        mapper
+            All of whose closed submaps are kept.
+        pings
+            Of its submaps.
+        setup
+            Digest of what another mapper must be set to, to go on from there.
+
+        Raises
+        ------
+        DataError
+            If the disk does not take it.
+        """
+        self._open.write(mapper, pings, setup)
+
+    def forget_open(self) -> None:
+        """From now on no run can be gone on with."""
+        self._open.remove()
+
+    def resume(self, vehicle_id: str, setup: bytes) -> ResumedRun | None:
+        """The run of the process before, if it can be gone on with: `take` it then.
+
+        Raises
+        ------
+        DataError
+            Naming what is damaged, or not whole.
+        """
+        kept = self._open.read(setup)
+        if kept is None:
+            return None
+        state, open_pings = kept
+        path = self._path_of(state.run_id)
+        records = self._read(path) if path in self.earlier else {}
+        submaps, pings = _run_of(records)
+        num = len(submaps)
+        if [s.sequence for s in submaps] != list(range(num)) or num - state.sequence not in (0, 1):
+            raise DataError(
+                f"{path} holds {num} submaps, expected {state.sequence} from the first"
+            )
+        if num == state.sequence:
+            pings[SubmapId(vehicle_id, state.run_id, num)] = open_pings
+        known = {
+            name: Record(Record.of(content).digest, _lost) for name, content in records.items()
+        }
+        closed = [(s, _weight_of(s, pings[s.submap_id])) for s in submaps]
+        drawn = [(ping.detections(), ping.T_submap_sonar) for ping in open_pings]
+        return ResumedRun(state, HeldSubmaps(closed, drawn), pings, known)
+
+    def take(self, run: ResumedRun) -> None:
+        """A run that was resumed is one of this process."""
+        path = self._path_of(run.state.run_id)
+        if path in self.earlier:
+            self.earlier.remove(path)
+            self._records[path] = run.records
+
     def load(self, path: Path) -> KeptRun:
         """One of `earlier`.
 
@@ -102,13 +183,10 @@ class KeptRuns:
         DataError
             Naming the file and what is wrong with it.
         """
+        records = self._read(path)
         try:
-            with opened(path) as (connection, version):
-                if version != VERSION:
-                    raise DataError(f"it is of format {version}, expected {VERSION}")
-                records = read_records(connection)
             return _run_of(records)
-        except (sqlite3.Error, OSError, KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{path} is not a whole run: {error}") from error
 
     def forget(self, path: Path) -> None:
@@ -118,6 +196,7 @@ class KeptRuns:
 
     def forget_own(self) -> None:
         """Remove the runs of this process."""
+        self._open.remove()
         for path in self._records:
             path.unlink(missing_ok=True)
         self._records.clear()
@@ -126,12 +205,32 @@ class KeptRuns:
         """Let another process have the folder."""
         self._lock.release()
 
+    def _read(self, path: Path) -> dict[RecordName, bytes]:
+        try:
+            with opened(path) as (connection, version):
+                if version != VERSION:
+                    raise DataError(f"it is of format {version}, expected {VERSION}")
+                return read_records(connection)
+        except (sqlite3.Error, OSError, TypeError, ValueError) as error:
+            raise DataError(f"{path} is not a whole run: {error}") from error
+
     def _path_of(self, run_id: int) -> Path:
         return self._folder / f"run_{run_id}.sqlite"
 
 
 def _lost() -> bytes:
     raise DataError("the file holds less than was written to it")
+
+
+def _weight_of(submap: Submap, pings: Sequence[DrawnPing]) -> NDArray[np.float64]:
+    """Weights (N,) of a submap's points: those of the echoes that lie nearest to each."""
+    num = len(submap.points)
+    if num == 0 or not pings:
+        return np.full(num, _LEAST_WEIGHT)
+    echoes = [ping.T_submap_sonar.apply(ping.points.astype(np.float64)) for ping in pings]
+    _, nearest = scipy.spatial.cKDTree(submap.points).query(np.vstack(echoes))
+    heard = np.concatenate([ping.weight for ping in pings])
+    return np.maximum(np.bincount(nearest, heard, num), _LEAST_WEIGHT)
 
 
 def _run_of(records: Mapping[RecordName, bytes]) -> KeptRun:
@@ -144,63 +243,6 @@ def _run_of(records: Mapping[RecordName, bytes]) -> KeptRun:
         first = submap_from_bytes(content, _MAX_BYTES)
         submap = dataclasses.replace(first, revision=revision, T_odom_submap=SE2(*place))
         submaps.append(submap)
-        pings[submap.submap_id] = _pings_from_bytes(records["pings", key])
+        arrays = arrays_from_bytes(records["pings", key], _MAX_BYTES)
+        pings[submap.submap_id] = pings_of_arrays(arrays)
     return submaps, pings
-
-
-def _pings_to_bytes(pings: Sequence[DrawnPing]) -> bytes:
-    return arrays_to_bytes(
-        {
-            "stamp_ns": np.array([p.stamp_ns for p in pings], np.int64),
-            "T_submap_sonar": np.array([p.T_submap_sonar.as_array() for p in pings]),
-            "T_dead_sonar": np.array(
-                [_UNKNOWN if p.T_dead_sonar is None else p.T_dead_sonar.as_array() for p in pings]
-            ),
-            "beamwidth_rad": np.array([p.beamwidth_rad for p in pings]),
-            "range_sigma_m": np.array([p.range_sigma_m for p in pings]),
-            "num_points": np.array([len(p.points) for p in pings], np.int64),
-            "points": np.vstack([np.empty((0, 2), np.float32), *(p.points for p in pings)]),
-            "weight": np.concatenate([np.empty(0, np.float32), *(p.weight for p in pings)]),
-            "num_beams": np.array([len(p.free_range_m) for p in pings], np.int64),
-            "free_range_m": np.concatenate(
-                [np.empty(0, np.float32), *(p.free_range_m for p in pings)]
-            ),
-            "bearing_rad": np.concatenate([np.empty(0), *(p.bearing_rad for p in pings)]),
-        }
-    )
-
-
-def _pings_from_bytes(content: bytes) -> list[DrawnPing]:
-    arrays = arrays_from_bytes(content, _MAX_BYTES)
-    points, beams = (np.cumsum(arrays[name])[:-1] for name in ("num_points", "num_beams"))
-    # Files of before do not have it.
-    dead_reckoning = arrays.get("T_dead_sonar", np.full((len(arrays["stamp_ns"]), 3), np.nan))
-    pings: list[DrawnPing] = []
-    for stamp_ns, place, dead, beamwidth_rad, sigma_m, xy, weight, free_m, bearing_rad in zip(
-        arrays["stamp_ns"].tolist(),
-        arrays["T_submap_sonar"],
-        dead_reckoning,
-        arrays["beamwidth_rad"].tolist(),
-        arrays["range_sigma_m"].tolist(),
-        np.split(arrays["points"], points),
-        np.split(arrays["weight"], points),
-        np.split(arrays["free_range_m"], beams),
-        np.split(arrays["bearing_rad"], beams),
-        strict=False,  # of no ping at all there is one empty part
-    ):
-        if pings and np.array_equal(pings[-1].bearing_rad, bearing_rad):
-            bearing_rad = pings[-1].bearing_rad  # as `pack_ping` does
-        pings.append(
-            DrawnPing(
-                stamp_ns,
-                SE2.from_array(place),
-                xy,
-                weight,
-                bearing_rad,
-                free_m,
-                beamwidth_rad,
-                sigma_m,
-                None if np.isnan(dead).any() else SE2.from_array(dead),
-            )
-        )
-    return pings

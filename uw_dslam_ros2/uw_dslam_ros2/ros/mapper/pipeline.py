@@ -28,6 +28,7 @@ _JUMP_BACK_S = 1.0  # stamps that go back by more are late, or show a clock that
 _MANY_DISPLACED = 50
 _MOUNT_PATIENCE_NS = 5_000_000_000
 _ODOM_PERIOD_NS = 100_000_000
+_KEEP_PERIOD_NS = 1_000_000_000
 
 
 class MapperPipeline:
@@ -62,7 +63,7 @@ class MapperPipeline:
         self._warn, self._streams_sent = warn, streams_sent
         self._map_period_s = config.map_period_s
         occupancy = mapper_config.occupancy
-        self._keeper = RunKeeper(config.session, occupancy, troubles.complain)
+        self._keeper = RunKeeper(config.session, vehicle_id, mapper_config, troubles.complain)
         self._last_pass = LastPass(occupancy, warn)
         self._runs = VehicleRuns(mapper_config, vehicle_id, _draw_run_id, self._last_pass.pings)
         self._order: StampOrder[SensorEvent] = StampOrder(
@@ -70,13 +71,16 @@ class MapperPipeline:
             int(_JUMP_BACK_S * 1e9),
             int(mapper_config.max_gap_s * 1e9),
         )
+        self._max_gap_s = mapper_config.max_gap_s
+        self._resumed_ns: int | None = None
+        self._resume()
         self._mountings = Mountings(base_frame)
         self._corrected = CorrectedMountings(config.conventions)
         self._watch = ConventionWatch(
             mapper_config.sonar, vehicle_id, troubles.note_convention, troubles.complain_of
         )
         self._drawing = Throttle(config.map_period_s)
-        self._odom_stamp_ns = self._map_stamp_ns = 0
+        self._odom_stamp_ns = self._map_stamp_ns = self._kept_ns = 0
         self._mapper_values: dict[str, float | int | str] = {}
         self.is_finished = self.is_paused = False
 
@@ -149,9 +153,37 @@ class MapperPipeline:
 
     def _begin_run(self, reason: RunBreak) -> None:
         self._give(self._runs.begin(reason))
-        self._odom_stamp_ns = self._map_stamp_ns = 0
+        self._keeper.forget_open()
+        self._odom_stamp_ns = self._map_stamp_ns = self._kept_ns = 0
         self.is_finished = False
         self._troubles.counts["num_restarts"] += 1
+
+    def _resume(self) -> None:
+        """Take over the run of the process before, where there is one."""
+        run = self._keeper.resume()
+        if run is None:
+            return
+        try:
+            self._runs.resume(run.state, run.held)
+        except InvalidInputError as error:
+            self._troubles.complain(f"the run of before cannot be gone on with: {error}")
+            return
+        self._keeper.take(run)
+        self._last_pass.pings.take(run.pings)
+        self._resumed_ns = self._mapper.stamp_ns
+
+    def _go_on(self, last_ns: int, stamp_ns: int) -> None:
+        """Go on with the run of before, or end it where the way since then is not known."""
+        gap_s = (stamp_ns - last_ns) * 1e-9
+        if -_JUMP_BACK_S <= gap_s <= self._max_gap_s:
+            self._warn(f"the run of before is gone on with, {gap_s:.1f} s after its last message")
+            return
+        way = "after" if gap_s > 0.0 else "before"
+        self._warn(
+            f"the first message is {abs(gap_s):.0f} s {way} the last one of the run of before: a "
+            "new run begins; what was mapped before is kept, and only registration joins the two"
+        )
+        self._begin_run(RunBreak("", last_ns, stamp_ns))
 
     def flush(self) -> None:
         """Use all that was held back for others; nothing earlier is expected any more."""
@@ -160,6 +192,8 @@ class MapperPipeline:
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is not None and stamp_ns > self._map_stamp_ns:
             self._publish_map(stamp_ns)
+        if stamp_ns is not None and stamp_ns > self._kept_ns:
+            self._keep_open(stamp_ns)
 
     def _drain(self) -> None:
         """Feed what is due, in the order of the stamps."""
@@ -176,6 +210,9 @@ class MapperPipeline:
         self._drain()
 
     def _feed(self, event: SensorEvent) -> None:
+        if self._resumed_ns is not None:
+            last_ns, self._resumed_ns = self._resumed_ns, None
+            self._go_on(last_ns, event.stamp_ns)
         T_base_sensor = self._mountings.of(event)
         self._troubles.note_mountings(self._mountings)
         try:
@@ -190,7 +227,7 @@ class MapperPipeline:
         self._give(submaps)
         self._last_pass.look()
         if self._troubles.note_breaks(self._runs):
-            self._odom_stamp_ns = self._map_stamp_ns = 0
+            self._odom_stamp_ns = self._map_stamp_ns = self._kept_ns = 0
         stamp_ns = self._mapper.stamp_ns
         if stamp_ns is None:
             return
@@ -199,9 +236,15 @@ class MapperPipeline:
             self._outputs.publish_odometry(self._mapper, stamp_ns)
         if isinstance(event, PINGS):
             self._mapper_values = self._runs.diagnostics()
+            if stamp_ns - self._kept_ns >= _KEEP_PERIOD_NS:
+                self._keep_open(stamp_ns)
             is_old = stamp_ns - self._map_stamp_ns >= self._map_period_s * 1e9
             if is_old and self._drawing.is_due():
                 self._publish_map(stamp_ns)
+
+    def _keep_open(self, stamp_ns: int) -> None:
+        self._kept_ns = stamp_ns
+        self._keeper.keep_open(self._mapper, self._last_pass.pings.of_submap)
 
     def _publish_map(self, stamp_ns: int) -> None:
         self._map_stamp_ns = stamp_ns

@@ -48,8 +48,8 @@ class SonarMapperConfig(SensorConfig):
     )
     session: str = setting(
         "",
-        doc="folder in which it keeps its pings, so that `finish` draws anew what it had mapped "
-        "before it was killed, too; one for each vehicle and mission; empty: none",
+        doc="folder in which it keeps what it maps, so that it goes on with its run when it is "
+        "started again after it was killed; one for each vehicle and mission; empty: none",
     )
     map_period_s: float = setting(
         2.0, 0.1, 3600.0, "between two maps, by the pings' stamps and by a steady clock [s]"
