@@ -130,6 +130,7 @@ def test_a_state_of_another_version_begins_a_new_run(
     monkeypatch.setattr(filter, "NUM_STATES", filter.NUM_STATES + 1)
     mapper = mapper_of(ros_context, session=str(tmp_path))
     with spinning(mapper):
+        mapper._worker.call(lambda: None).result()
         assert mapper._pipeline._runs.mapper.run_id != state.run_id
         assert len(mapper._pipeline._keeper._runs.earlier) == 1
 

@@ -73,7 +73,6 @@ class MapperPipeline:
         )
         self._max_gap_s = mapper_config.max_gap_s
         self._resumed_ns: int | None = None
-        self._resume()
         self._mountings = Mountings(base_frame)
         self._corrected = CorrectedMountings(config.conventions)
         self._watch = ConventionWatch(
@@ -158,8 +157,8 @@ class MapperPipeline:
         self.is_finished = False
         self._troubles.counts["num_restarts"] += 1
 
-    def _resume(self) -> None:
-        """Take over the run of the process before, where there is one."""
+    def resume(self) -> None:
+        """Take over the run of the process before, where there is one; before any event."""
         run = self._keeper.resume()
         if run is None:
             return

@@ -74,6 +74,8 @@ class SonarMapper(ManagedNode):
         self.at_end(self._pipeline.close)
         self._worker = Worker("mapper", self._troubles.complain_of)
         self.at_end(lambda: self._worker.close(_CLOSE_S))
+        # A long run takes seconds to read, while sensors speak already.
+        self._worker.post(self._pipeline.resume)
         self.at_end(self._say_last)
         self._group = MutuallyExclusiveCallbackGroup()
         self._transforms = Transforms(
