@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from harness import emit, require, run_cases
 
+from uw_dslam_ros2.core.chart.pings import KeptPings
 from uw_dslam_ros2.core.mapping import VehicleMapper, VehicleMapperConfig, section
 from uw_dslam_ros2.core.mapping import vehicle_mapper as mapper_module
 from uw_dslam_ros2.core.mapping.loops import estimators
@@ -26,6 +27,7 @@ from uw_dslam_ros2.core.metrics import trajectory_error
 from uw_dslam_ros2.core.sonar import SonarImage
 from uw_dslam_ros2.io.drivers.projected_image import read_projected
 from uw_dslam_ros2.io.drivers.settings import ReadSettings
+from uw_dslam_ros2.io.heap import trim
 from uw_dslam_ros2.io.interfaces import make_typestore
 from uw_dslam_ros2.io.outgoing import MessageFactory
 from uw_dslam_ros2.sim.missions.mission import T_BASE_DVL, T_BASE_SONAR, MissionConfig, PingMaker
@@ -36,6 +38,8 @@ from uw_dslam_ros2.sim.waters.world import cast_rays
 _NUM_BEAMS, _NUM_RANGES, _RATE_HZ = 512, 1000, 10.0
 _S = 1_000_000_000
 _REACH_M = 25.0
+_MAX_PING_BYTES = 128 * 2**20
+"""As in the node, see `ros.mapper.last_pass`."""
 
 
 class _Stages:
@@ -134,13 +138,15 @@ def ping(is_quick: bool) -> None:
 def memory(is_quick: bool) -> None:
     """Memory of the mapper over hours, with scans of the walls in place of images.
 
-    Nothing of an image is kept anyway. The map is asked for each minute, as the node does.
+    Nothing of an image is kept anyway. As in the node, the map is asked for each minute, pings
+    are kept for the last pass, and what closing a submap took is given back.
     """
     duration_s = 240.0 if is_quick else 7200.0
     small = replace(_mission_config(duration_s), ping_rate_hz=1.0)
     mission = plan(small)
     run = mission.runs[0]
-    mapper = VehicleMapper(VehicleMapperConfig(), "auv_1")
+    kept = KeptPings(_MAX_PING_BYTES)
+    mapper = VehicleMapper(VehicleMapperConfig(), "auv_1", watch=kept)
     rng = np.random.default_rng(small.seed)
     poses, bearings = run.sonar_poses(), np.linspace(-1.1, 1.1, 128)
     before_mib, samples, seconds, map_seconds = _resident_mib(), [], 0.0, []
@@ -150,7 +156,8 @@ def memory(is_quick: bool) -> None:
         start = time.process_time()
         navigation(mapper)
         stamp_ns = int(run.ping_motion.stamp_ns[i])
-        mapper.add_scan(stamp_ns, bearings, ranges, _REACH_M, T_BASE_SONAR)
+        if mapper.add_scan(stamp_ns, bearings, ranges, _REACH_M, T_BASE_SONAR):
+            trim()
         seconds += time.process_time() - start
         if i % 60 == 59:
             start = time.process_time()
@@ -165,6 +172,8 @@ def memory(is_quick: bool) -> None:
         "mib_at_half": mib[0], "mib_at_end": mib[-1],
         "mib_per_hour": np.polyfit(hours, mib, 1)[0],
         "mib_kept_in_submaps": _closed_bytes(mapper) / 2**20,
+        "mib_kept_in_pings": kept.num_bytes / 2**20,
+        "mib_of_the_process": before_mib + mib[-1],
         "navigation_records": len(mapper._navigation._records),
         "share_of_a_core": seconds / duration_s,
         "last_map_ms": 1e3 * float(np.median(map_seconds[-5:])),
