@@ -140,6 +140,10 @@ def test_the_picture_has_its_first_row_on_top(tmp_path):
             "origin is [0.0, '.nan', 0.0], expected [x, y, yaw]",
         ),
         ({"origin": [0.0, 1.0, "east"]}, "origin is [0.0, 1.0, 'east'], expected [x, y, yaw]"),
+        (
+            {"origin": [0.0, 1.0, "-nan"]},
+            "in metres and radians; if the map is not turned, write 0 for nan",
+        ),
         ({"origin": "0 0 0"}, "origin is '0 0 0', expected [x, y, yaw]"),
         ({"origin": None}, "origin is missing, expected [x, y, yaw]"),
         ({"mode": "quaternary"}, "mode is 'quaternary', expected trinary, scale or raw"),

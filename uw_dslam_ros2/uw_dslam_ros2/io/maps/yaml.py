@@ -118,7 +118,11 @@ class _Keys:
         numbers = [_as_number(v) for v in value] if isinstance(value, list) else []
         known = [number for number in numbers if number is not None]
         if len(numbers) != 3 or len(known) != 3:
-            raise self.error("origin", "[x, y, yaw] in metres and radians")
+            expected = "[x, y, yaw] in metres and radians"
+            if isinstance(value, list) and len(known) == 2 and value[2:] in (["nan"], ["-nan"]):
+                # What map_saver writes of a map whose orientation is no rotation.
+                expected += "; if the map is not turned, write 0 for nan"
+            raise self.error("origin", expected)
         return SE2(*known)
 
 
