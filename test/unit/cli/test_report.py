@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from uw_dslam_ros2.cli.reporting.report import RunFacts, headline, write_report
 from uw_dslam_ros2.cli.reporting.scoring import Scores, Truth, read_truth, score
 from uw_dslam_ros2.core.errors import DataError
 from uw_dslam_ros2.core.grid import GridSpec, OccupancyMap
-from uw_dslam_ros2.core.merging import Decision, DecisionKind
+from uw_dslam_ros2.core.merging import Decision, DecisionKind, SubmapRecord
 from uw_dslam_ros2.core.se2 import SE2
 from uw_dslam_ros2.core.submap import SubmapId
 from uw_dslam_ros2.io.maps.files import read_map, write_map
@@ -150,6 +151,34 @@ def test_any_number_of_vehicles_can_be_drawn(num_vehicles: int) -> None:
     for i, a in enumerate(boxes):
         for b in boxes[:i]:
             assert a.x0 >= b.x1 or b.x0 >= a.x1 or a.y0 >= b.y1 or b.y0 >= a.y1
+
+
+def test_long_names_cover_nothing_and_are_not_cut_off() -> None:
+    outcome = missions.outcome(("auv_1", "auv_2"))
+    names = [v.vehicle_id for v in outcome.vehicles]
+    long = {name: 3 * "ground_floor_of_the_old_library/" + name for name in names}
+
+    def renamed(record: SubmapRecord) -> SubmapRecord:
+        submap = record.submap
+        return replace(record, submap=replace(submap, vehicle_id=long[submap.vehicle_id]))
+
+    outcome = replace(
+        outcome,
+        vehicles=tuple(replace(v, vehicle_id=long[v.vehicle_id]) for v in outcome.vehicles),
+        records=tuple(renamed(record) for record in outcome.records),
+    )
+    figure = pictures.before_after(outcome, "title")
+    width, height = figure.get_size_inches()
+    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    for i, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:i])
+    data = np.frombuffer(pictures.png_bytes(figure, dpi=100), np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    assert picture.shape[0] >= 100 * height - 1
+    assert picture.shape[1] >= 100 * width - 1
+    # Ink up to the rim would be a text that goes on.
+    for rim in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
+        assert rim.min() == 255
 
 
 def test_a_thin_wall_survives_the_reduction() -> None:

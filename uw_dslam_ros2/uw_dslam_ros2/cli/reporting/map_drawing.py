@@ -69,6 +69,7 @@ INK = "#1c2733"
 _MAX_PIXELS = 1600
 _STRIP_ROWS = 256
 _MARGIN_CELLS = 12
+_MAX_NAME = 19  # characters of a title of the narrowest picture
 GAP, HEAD, TITLE, FOOT = 0.25, 0.75, 0.32, 0.42  # inches
 
 
@@ -274,18 +275,31 @@ def shade_handles() -> list[Patch]:
 
 
 def legend_below(axes: Axes, handles: list[Any]) -> None:
-    """Put a legend below the picture."""
-    axes.legend(
-        handles=handles,
-        loc="upper left",
-        bbox_to_anchor=(0.0, -0.01),
-        ncols=min(len(handles), 8),
-        frameon=False,
-        fontsize=9,
-        handlelength=1.4,
-        columnspacing=1.4,
-        borderaxespad=0.2,
-    )
+    """Put a legend below the picture, in as many columns as the figure has room for."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None  # the axes are drawn
+    for columns in range(min(len(handles), 8), 0, -1):
+        legend = axes.legend(
+            handles=handles,
+            loc="upper left",
+            bbox_to_anchor=(0.0, -0.01),
+            ncols=columns,
+            frameon=False,
+            fontsize=9,
+            handlelength=1.4,
+            columnspacing=1.4,
+            borderaxespad=0.2,
+        )
+        if legend.get_window_extent().x1 <= figure.bbox.x1:
+            return
+
+
+def shortened(name: str) -> str:
+    """A name that fits into a picture: of a long one, the middle is left out."""
+    if len(name) <= _MAX_NAME:
+        return name
+    half = (_MAX_NAME - 1) // 2
+    return f"{name[:half]}\u2026{name[-half:]}"
 
 
 def near_walls(walls: NDArray[np.bool_], distance_cells: float) -> NDArray[np.bool_]:

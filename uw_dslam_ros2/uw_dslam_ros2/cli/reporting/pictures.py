@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -40,6 +41,7 @@ from uw_dslam_ros2.cli.reporting.map_drawing import (
     scale_bar,
     set_title,
     shade_handles,
+    shortened,
     show_cells,
     show_map,
     show_picture,
@@ -77,11 +79,14 @@ def vehicle_colors(vehicles: Sequence[str]) -> dict[str, str]:
 
 
 def png_bytes(figure: Figure, dpi: int = 110) -> bytes:
-    """Encode a figure; the same figure gives the same bytes."""
+    """Encode a figure with all that sticks out of it; the same figure gives the same bytes."""
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(dpi)
-    canvas.draw()
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    drawn = figure.get_tightbbox(canvas.get_renderer()).padded(0.05)
+    drawing = io.BytesIO()
+    box = Bbox.union([Bbox.from_bounds(0.0, 0.0, *figure.get_size_inches()), drawn])
+    canvas.print_figure(drawing, dpi=dpi, format="png", bbox_inches=box)
+    picture = Image.open(drawing).convert("RGB")
     # Pictures of maps have few colours: with a palette they are a third of the size.
     buffer = io.BytesIO()
     picture.quantize(192, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(
@@ -104,7 +109,7 @@ def before_after(outcome: Outcome, title: str, members: str = "vehicles") -> Fig
         scale_bar(axes)
         # One title: a second one would lie on it where the picture is small.
         state = " alone" if vehicle.is_merged else ": not merged"
-        set_title(axes, f"{vehicle.vehicle_id}{state}")
+        set_title(axes, f"{shortened(vehicle.vehicle_id)}{state}")
     _show_merged(figure.add_axes(layout.share(layout.large)), outcome, colors, members)
     figure.text(
         GAP / layout.width,
@@ -185,7 +190,7 @@ class _Layout:
 
 def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str], members: str) -> None:
     merged = [v for v in outcome.vehicles if v.is_merged]
-    left = [v.vehicle_id for v in outcome.vehicles if not v.is_merged]
+    left = [shortened(v.vehicle_id) for v in outcome.vehicles if not v.is_merged]
     set_title(
         axes,
         f"one map: {len(merged)} of {len(outcome.vehicles)} {members}",
@@ -207,7 +212,7 @@ def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str], member
         color = colors[vehicle.vehicle_id]
         if vehicle.trajectory is not None:
             draw_way(axes, vehicle.trajectory, color)
-        handles.append(Line2D([], [], color=color, lw=2, label=vehicle.vehicle_id))
+        handles.append(Line2D([], [], color=color, lw=2, label=shortened(vehicle.vehicle_id)))
     handles += [
         Line2D(
             [],
