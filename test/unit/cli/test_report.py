@@ -181,6 +181,14 @@ def test_long_names_cover_nothing_and_are_not_cut_off() -> None:
         assert rim.min() == 255
 
 
+def test_names_in_pictures_stay_different() -> None:
+    names = ["maps_of_the_library/lab@2024", "maps_of_the_library/lab1@2024"]
+    short = map_drawing.shortened(names)
+    assert len({*short.values()}) == 2
+    assert all(len(name) <= 15 for name in short.values())
+    assert map_drawing.shortened(["auv_1", "auv_2"]) == {"auv_1": "auv_1", "auv_2": "auv_2"}
+
+
 def test_a_thin_wall_survives_the_reduction() -> None:
     num_cells = 4000
     values = np.zeros((8, num_cells), dtype=np.int8)

@@ -69,7 +69,7 @@ INK = "#1c2733"
 _MAX_PIXELS = 1600
 _STRIP_ROWS = 256
 _MARGIN_CELLS = 12
-_MAX_NAME = 19  # characters of a title of the narrowest picture
+_MAX_NAME = 15  # characters of a title of the narrowest picture
 GAP, HEAD, TITLE, FOOT = 0.25, 0.75, 0.32, 0.42  # inches
 
 
@@ -294,8 +294,17 @@ def legend_below(axes: Axes, handles: list[Any]) -> None:
             return
 
 
-def shortened(name: str) -> str:
-    """A name that fits into a picture: of a long one, the middle is left out."""
+def shortened(names: Sequence[str]) -> dict[str, str]:
+    """Names that fit into a picture, and differ: of long ones, the middle is left out."""
+    short = {name: _without_middle(name) for name in names}
+    if len(set(short.values())) < len(set(names)):
+        letters = enumerate(zip(*names, strict=False))
+        start = next((i for i, found in letters if len({*found}) > 1), min(map(len, names)))
+        short = {name: _without_middle(f"\u2026{name[start:]}") for name in names}
+    return short if len(set(short.values())) == len(set(names)) else {n: n for n in names}
+
+
+def _without_middle(name: str) -> str:
     if len(name) <= _MAX_NAME:
         return name
     half = (_MAX_NAME - 1) // 2

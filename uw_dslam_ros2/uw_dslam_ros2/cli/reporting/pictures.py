@@ -98,6 +98,7 @@ def png_bytes(figure: Figure, dpi: int = 110) -> bytes:
 def before_after(outcome: Outcome, title: str, members: str = "vehicles") -> Figure:
     """Each vehicle's map by itself, and the one map of all, with ways and seams."""
     colors = vehicle_colors([v.vehicle_id for v in outcome.vehicles])
+    names = shortened([v.vehicle_id for v in outcome.vehicles])
     own = [extent_m(vehicle.own_map) for vehicle in outcome.vehicles]
     merged = (1.0, 1.0) if outcome.global_map is None else extent_m(outcome.global_map)
     layout = _Layout.of(own, merged)
@@ -109,7 +110,7 @@ def before_after(outcome: Outcome, title: str, members: str = "vehicles") -> Fig
         scale_bar(axes)
         # One title: a second one would lie on it where the picture is small.
         state = " alone" if vehicle.is_merged else ": not merged"
-        set_title(axes, f"{shortened(vehicle.vehicle_id)}{state}")
+        set_title(axes, f"{names[vehicle.vehicle_id]}{state}")
     _show_merged(figure.add_axes(layout.share(layout.large)), outcome, colors, members)
     figure.text(
         GAP / layout.width,
@@ -189,12 +190,14 @@ class _Layout:
 
 
 def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str], members: str) -> None:
+    names = shortened([v.vehicle_id for v in outcome.vehicles])
     merged = [v for v in outcome.vehicles if v.is_merged]
-    left = [shortened(v.vehicle_id) for v in outcome.vehicles if not v.is_merged]
+    left = [names[v.vehicle_id] for v in outcome.vehicles if not v.is_merged]
     set_title(
         axes,
         f"one map: {len(merged)} of {len(outcome.vehicles)} {members}",
-        f"not merged: {', '.join(left)}" if left else "",
+        # The small pictures name them, too.
+        f"not merged: {', '.join(left) if len(left) < 3 else len(left)}" if left else "",
     )
     if outcome.global_map is None:
         axes.text(0.5, 0.5, "nothing was merged", ha="center", transform=axes.transAxes)
@@ -212,7 +215,7 @@ def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str], member
         color = colors[vehicle.vehicle_id]
         if vehicle.trajectory is not None:
             draw_way(axes, vehicle.trajectory, color)
-        handles.append(Line2D([], [], color=color, lw=2, label=shortened(vehicle.vehicle_id)))
+        handles.append(Line2D([], [], color=color, lw=2, label=names[vehicle.vehicle_id]))
     handles += [
         Line2D(
             [],
