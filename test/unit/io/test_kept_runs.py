@@ -245,7 +245,8 @@ def test_a_file_that_is_cut_off_loses_its_last_second(tmp_path):
 def test_with_other_settings_no_run_is_gone_on_with(tmp_path):
     killed_in(tmp_path)
     with closing(KeptRuns(tmp_path)) as later:
-        assert later.resume("auv_1", b"settings of two!") is None
+        with pytest.raises(DataError, match="other settings: what was in its open submap is lost"):
+            later.resume("auv_1", b"settings of two!")
         assert len(later.earlier) == 1  # it is drawn anew as before
 
 

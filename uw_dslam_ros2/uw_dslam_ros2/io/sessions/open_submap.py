@@ -87,7 +87,10 @@ class OpenSubmapFile:
         try:
             for content in _additions(self._path.read_bytes()):
                 if content[: len(setup)] != setup:
-                    return None
+                    raise DataError(
+                        f"{self._path} is of a mapper with other settings: what was in its open "
+                        "submap is lost"
+                    )
                 arrays = arrays_from_bytes(content[len(setup) :], _MAX_BYTES)
                 states.append(_state_of_arrays(arrays))
                 pings += pings_of_arrays(
