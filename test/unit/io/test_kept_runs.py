@@ -1,6 +1,7 @@
 """What a mapper keeps of a run comes back as it was given away last."""
 
 import dataclasses
+import sqlite3
 from contextlib import closing
 
 import numpy as np
@@ -256,6 +257,17 @@ def test_a_run_that_lacks_a_submap_is_not_gone_on_with(tmp_path):
     path.unlink()
     with closing(KeptRuns(tmp_path)) as later, pytest.raises(DataError, match="holds 0 submaps"):
         later.resume("auv_1", SETUP)
+
+
+def test_a_run_that_lacks_a_record_is_told_as_it_is_where_it_is_drawn_anew(tmp_path):
+    killed_in(tmp_path)
+    (path,) = tmp_path.glob("run_*.sqlite")
+    with closing(sqlite3.connect(path)) as connection, connection:
+        assert connection.execute("DELETE FROM records WHERE kind = ?", (b"pose",)).rowcount
+    with closing(KeptRuns(tmp_path)) as later:
+        for read in (lambda: later.load(path), lambda: later.resume("auv_1", SETUP)):
+            with pytest.raises(DataError, match="is not a whole run"):
+                read()
 
 
 def test_where_pings_are_left_out_no_run_is_gone_on_with(tmp_path):

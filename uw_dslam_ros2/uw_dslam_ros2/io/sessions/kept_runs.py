@@ -152,8 +152,7 @@ class KeptRuns:
             return None
         state, open_pings = kept
         path = self._path_of(state.run_id)
-        records = self._read(path) if path in self.earlier else {}
-        submaps, pings = _run_of(records)
+        records, (submaps, pings) = self._read(path) if path in self.earlier else ({}, ([], {}))
         num = len(submaps)
         if [s.sequence for s in submaps] != list(range(num)) or num - state.sequence not in (0, 1):
             raise DataError(
@@ -183,11 +182,7 @@ class KeptRuns:
         DataError
             Naming the file and what is wrong with it.
         """
-        records = self._read(path)
-        try:
-            return _run_of(records)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path} is not a whole run: {error}") from error
+        return self._read(path)[1]
 
     def forget(self, path: Path) -> None:
         """Remove one of `earlier`."""
@@ -205,13 +200,15 @@ class KeptRuns:
         """Let another process have the folder."""
         self._lock.release()
 
-    def _read(self, path: Path) -> dict[RecordName, bytes]:
+    def _read(self, path: Path) -> tuple[dict[RecordName, bytes], KeptRun]:
+        """A file's records, and what they say."""
         try:
             with opened(path) as (connection, version):
                 if version != VERSION:
                     raise DataError(f"it is of format {version}, expected {VERSION}")
-                return read_records(connection)
-        except (sqlite3.Error, OSError, TypeError, ValueError) as error:
+                records = read_records(connection)
+            return records, _run_of(records)
+        except (sqlite3.Error, OSError, KeyError, TypeError, ValueError) as error:
             raise DataError(f"{path} is not a whole run: {error}") from error
 
     def _path_of(self, run_id: int) -> Path:

@@ -88,8 +88,8 @@ class OpenSubmapFile:
             for content in _additions(self._path.read_bytes()):
                 if content[: len(setup)] != setup:
                     raise DataError(
-                        f"{self._path} is of a mapper with other settings: what was in its open "
-                        "submap is lost"
+                        "it is of a mapper with other settings: what was in its open submap is "
+                        "lost"
                     )
                 arrays = arrays_from_bytes(content[len(setup) :], _MAX_BYTES)
                 states.append(_state_of_arrays(arrays))
