@@ -85,7 +85,9 @@ def png_bytes(figure: Figure, dpi: int = 110) -> bytes:
     drawn = figure.get_tightbbox(canvas.get_renderer()).padded(0.05)
     drawing = io.BytesIO()
     box = Bbox.union([Bbox.from_bounds(0.0, 0.0, *figure.get_size_inches()), drawn])
-    canvas.print_figure(drawing, dpi=dpi, format="png", bbox_inches=box)
+    canvas.print_figure(
+        drawing, dpi=dpi, format="png", bbox_inches=box, pil_kwargs={"compress_level": 0}
+    )
     picture = Image.open(drawing).convert("RGB")
     # Pictures of maps have few colours: with a palette they are a third of the size.
     buffer = io.BytesIO()
@@ -111,7 +113,7 @@ def before_after(outcome: Outcome, title: str, members: str = "vehicles") -> Fig
         # One title: a second one would lie on it where the picture is small.
         state = " alone" if vehicle.is_merged else ": not merged"
         set_title(axes, f"{names[vehicle.vehicle_id]}{state}")
-    _show_merged(figure.add_axes(layout.share(layout.large)), outcome, colors, members)
+    _show_merged(figure.add_axes(layout.share(layout.large)), outcome, colors, names, members)
     figure.text(
         GAP / layout.width,
         1.0 - 0.22 / layout.height,
@@ -189,8 +191,13 @@ class _Layout:
         return cls(width + 2.0 * GAP, bottom + row + HEAD, tuple(boxes), large)
 
 
-def _show_merged(axes: Axes, outcome: Outcome, colors: Mapping[str, str], members: str) -> None:
-    names = shortened([v.vehicle_id for v in outcome.vehicles])
+def _show_merged(
+    axes: Axes,
+    outcome: Outcome,
+    colors: Mapping[str, str],
+    names: Mapping[str, str],
+    members: str,
+) -> None:
     merged = [v for v in outcome.vehicles if v.is_merged]
     left = [names[v.vehicle_id] for v in outcome.vehicles if not v.is_merged]
     set_title(
